@@ -73,9 +73,9 @@ def main() -> None:
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run the command line ``ethbrake ARGUMENTS``, and return its exit status.
+    """Run the command line ``ethbrake ARGUMENTS``, and return the exit status.
 
-    0: success. 1: the reader of the output has closed the pipe. 2: wrong usage, invalid input or a file error,
+    0: success. 1: the program that reads the output has closed the pipe. 2: wrong usage, invalid input or a file error,
     explained in one line on stderr. 130: Ctrl-C. A command may choose another status. Every other exception is a bug of
     this program and is raised.
     """
@@ -114,7 +114,7 @@ def run_command(arguments: Sequence[str]) -> int:
 
 
 def _status_of(arguments: Sequence[str]) -> int:
-    """Status with which a command ends. SystemExit: of typer, or of a command from another package."""
+    """Exit status of a command. Typer, or a command of another package, may raise ``SystemExit`` to set it."""
     try:
         with naming_extras():
             command = whole_command()
@@ -134,7 +134,7 @@ def _status_of(arguments: Sequence[str]) -> int:
 def _shell_asks(environment: Mapping[str, str]) -> bool:
     """Whether a shell has started this program to complete a command line (see ``--show-completion``).
 
-    False if only one of the shell's variables for completion is set: it may be left over from an earlier command.
+    False if only one of the shell's variables for completion is set: it may remain from an earlier command.
     """
     if environment.get(_COMPLETE) == "complete_bash":
         return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
@@ -151,8 +151,8 @@ def prepare_streams() -> None:
     """Set up stdout, stderr and warnings for the command line.
 
     Characters that stdout's encoding lacks, such as m², are printed as ``?``. Text that libraries and child processes
-    write to stdout without Python's ``sys.stdout`` goes to stderr. Warnings of this package are printed in one line. A
-    message announces the first compilation of numba kernels.
+    write to stdout without Python's ``sys.stdout`` goes to stderr. Each warning of this package is printed on one line.
+    A message announces the first compilation of numba kernels.
     """
     for name, mode in (("stdin", "r"), ("stdout", "r"), ("stderr", "w")):  # a closed stdout refuses results
         if getattr(sys, name) is None:  # closed by the caller: keep its number from the next file that is opened
@@ -176,7 +176,7 @@ def prepare_streams() -> None:
 
 
 def print_compilation(is_empty: bool) -> None:
-    """Print that numba kernels are being compiled. ``is_empty``: none are stored yet."""
+    """Print that numba kernels are being compiled. ``is_empty``: whether no kernels are stored yet."""
     part = "the physics for the first time, which takes a while" if is_empty else "parts of the physics"
     Out().note(f"compiling {part}{'' if obstacle() else '; later commands use the stored result'}")
 
@@ -221,7 +221,7 @@ COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.from
 class Installed(TyperCommand):
     """A command of an extension or another installed package. Its code is imported only when the command is called.
 
-    ``entry`` is the name of its entry point, ``NAME`` or ``GROUP.NAME``.
+    ``entry``: name of the command's entry point, ``NAME`` or ``GROUP.NAME``.
     """
 
     def __init__(self, entry: str) -> None:
@@ -244,7 +244,7 @@ class Installed(TyperCommand):
 
 
 def with_installed(group: Any, name: str) -> Any:
-    """Add the installed commands with entry points ``NAME.COMMAND`` to the command group ``name``; return the group."""
+    """Command group ``name``, after the installed commands with entry points ``NAME.COMMAND`` were added to it."""
     for entry in points(COMMANDS.group):
         owner, _, command_name = entry.rpartition(".")
         if owner == name:
@@ -254,12 +254,12 @@ def with_installed(group: Any, name: str) -> Any:
 
 @cache
 def _built(*registered: object) -> Any:
-    """Commands of ``app``, built once (100 ms) while the same are registered. They must not be changed."""
+    """The commands of ``app``, built once (100 ms) as long as the same commands are registered. Do not change them."""
     return get_command(app)
 
 
 def _copy_command(command: Any) -> Any:
-    """Copy of a command whose groups can get other commands."""
+    """Copy of a command. If the command is a group, commands can be added to the copy without changing the original."""
     copied = copy(command)
     if hasattr(command, "commands"):
         copied.commands = {name: _copy_command(subcommand) for name, subcommand in command.commands.items()}
@@ -267,7 +267,7 @@ def _copy_command(command: Any) -> Any:
 
 
 def whole_command() -> Any:
-    """Program with all commands: the core's, those of installed packages, and those of ``add_command``.
+    """The program with all commands: the core's, those of installed packages, and those of ``add_command``.
 
     Raises ``AlreadyExists`` if two commands have the same name.
     """

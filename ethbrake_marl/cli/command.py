@@ -56,9 +56,10 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on s
 
 
 def schema_option(module: str, function: str, kind: str) -> Any:
-    """Type of an option ``--schema``, which prints the JSON Schema of a ``kind`` of file and exits.
+    """Type of the option ``--schema``, which prints a JSON Schema and exits.
 
-    ``function`` in ``module`` returns the schema. The module is imported only when the option is used.
+    ``function`` in ``module`` returns the schema; the module is imported only when the option is used. ``kind``: kind
+    of file that the schema describes, in words.
     """
 
     def show_schema(wants_schema: bool) -> None:
@@ -71,7 +72,7 @@ def schema_option(module: str, function: str, kind: str) -> Any:
 
 
 def example(*lines: str) -> str:
-    """Examples for the end of a help page. ``lines`` are commands without the word ``ethbrake``."""
+    """Text with examples, for the end of a help page. ``lines``: commands without the word ``ethbrake``."""
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 
@@ -84,7 +85,7 @@ class Out:
     """Output of a command, used as ``with Out() as out``.
 
     Inside the block only results go to stdout; everything else, such as what a user's agent prints, goes to stderr.
-    Ctrl-C ends the command with exit status 130 and a message, which ends with ``remains``: a text about files left
+    Ctrl-C ends the command with exit status 130 and a message. ``remains``: end of this message, about files left
     behind.
     """
 
@@ -111,9 +112,9 @@ class Out:
             raise InvalidInput(f"your own code ended the process: SystemExit: {error.code}") from error
 
     def result(self, content: Any, *parts: RenderableType, end: str = "\n", in_file: bool = False) -> None:
-        """Print the result: ``content`` as JSON if the user gave ``--json``, otherwise ``parts``.
+        """Print the result: ``content`` as JSON if the user chose ``--json``, otherwise ``parts``.
 
-        ``in_file``: a file contains the result, so nothing is lost if standard output is closed.
+        ``in_file``: whether a file also contains the result, so that nothing is lost if stdout is closed.
         """
         if in_file and not self._stdout.writable():
             return
@@ -145,8 +146,8 @@ class Out:
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
         """Raise an error, before any work, if a file cannot be written. ``path=None`` means no file.
 
-        ``endings`` are the allowed file extensions, such as ``.csv``; without them all are allowed. ``what`` is the
-        file's content in error messages. Raises ``InvalidInput``, or ``AlreadyExists`` without ``--force``.
+        ``endings``: allowed file extensions, such as ``.csv``; none: all are allowed. ``what``: content of the file, in
+        error messages. Raises ``InvalidInput``, or ``AlreadyExists`` without ``--force``.
         """
         if path is None:
             return
@@ -157,7 +158,7 @@ class Out:
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
-        """Write a file completely or not at all. If ``what`` is set, print ``WHAT: PATH`` on stderr."""
+        """Write a file completely or not at all. With ``what``, print ``WHAT: PATH`` on stderr."""
         from ethbrake_marl.files.store import write_output
 
         write_output(path, content.encode() if isinstance(content, str) else content, force=self.force)
@@ -175,16 +176,17 @@ class Out:
 class _PlainConsole(Console):
     """Console of the library rich that prints texts literally, without markup, and escapes control characters.
 
-    In a notebook, too, it prints to ``file``.
-
-    ``width`` is in characters; None: the terminal's width.
+    In a notebook, it also prints to ``file``. ``width``: in characters; None: the terminal's width.
     """
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:
         super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False, force_jupyter=False)
 
     def on_broken_pipe(self) -> NoReturn:
-        """Raise the ``BrokenPipeError`` again; rich would discard stderr, where stdout is redirected, and exit."""
+        """Raise the ``BrokenPipeError`` again.
+
+        Rich itself would discard stderr, where stdout is redirected, and exit.
+        """
         raise
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:

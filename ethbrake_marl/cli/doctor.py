@@ -62,7 +62,7 @@ class Check:
 def diagnose(*, compile_all: bool = False) -> list[Check]:
     """Results of all checks, in the order in which the user should solve problems.
 
-    With ``compile_all``, also compile the numba kernels (``compile_ahead``).
+    ``compile_all``: also compile the numba kernels (``compile_ahead``).
     """
     has_torch = find_spec("torch") is not None
     return [
@@ -86,6 +86,7 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
+    """Check that each required package is installed, in a version that fits; and those of the extras."""
     from packaging.requirements import Requirement
 
     from ethbrake_marl.faces.rendering import RENDERERS, why_not
@@ -168,8 +169,8 @@ def _golden_baseline() -> tuple[bool, str]:
 def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
     """Compile and store the numba kernels of the usual commands, by running these commands on a few worlds.
 
-    ``training``: also run ``ethbrake run``, which needs torch. ``run_alone``: run only the one command that compiles
-    nearly all kernels of ``ethbrake run``. Returns whether all commands succeeded, and a message for the user.
+    ``training``: also run ``ethbrake run``, which needs torch. ``run_alone``: run only the command that compiles nearly
+    all kernels of ``ethbrake run``. Returns whether all commands succeeded, and a message for the user.
     """
     if reason := obstacle():
         return False, f"{reason}; {UNSTORED}"

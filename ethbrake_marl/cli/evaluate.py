@@ -110,6 +110,7 @@ def _compare(
 
 
 def _show(out: Out, comparisons: dict[str, Compared], output: Path | None, per_world: Any, page: str) -> None:
+    """Write the results to the folder ``output``, if there is one, and print them."""
     from ethbrake_marl.evaluation.results import write_results
     from ethbrake_marl.evaluation.summary import summarise_lists
 
@@ -134,6 +135,7 @@ def _show(out: Out, comparisons: dict[str, Compared], output: Path | None, per_w
 
 
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
+    """Raise an error, before any work, if the result's files cannot be written or an option lacks a folder."""
     if output is None:
         for option, value in (("--per-world", per_world), ("--report", report)):
             if value:

@@ -1,4 +1,4 @@
-"""Registry of the functions of extensions that draw the pages and pictures of commands."""
+"""Registry of functions by which extensions draw the pages and pictures of commands."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PAGES: Registry[Callable[..., Any]] = Registry("page", "pages", register_page)
 
 
 def page_function(shows: str, option: str) -> Callable[..., None]:
-    """Function registered for a page. Raises ``InvalidInput`` without one; its message begins with ``option``."""
+    """Registered function for a page. Raises ``InvalidInput``, which begins with ``option``, if there is none."""
     if shows not in PAGES:
         raise InvalidInput(f"{option}: the extension that draws this page ({shows}) is not installed")
     return PAGES[shows]

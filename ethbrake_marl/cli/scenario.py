@@ -89,6 +89,7 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
 
 def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
+    """Lines about a scenario's trial, for the user."""
     n, ranges = trial.drawn.worlds.n, _ranges(trial)
     learners = ", ".join(trial.known) or "none"
     yield f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; tried in {n} worlds"

@@ -19,6 +19,8 @@ NO_SETTING = {"name", "title", "description", "source"}  # words, which cannot b
 
 
 class CommandSettings(NamedTuple):
+    """Settings of a command, by what they change."""
+
     texts: tuple[str, ...]  # as written
     scenario: list[Override]
     recipe: list[Override]
@@ -38,11 +40,11 @@ class CommandSettings(NamedTuple):
 def read_settings(
     texts: Sequence[str] | None, recipe_keys: Sequence[str] = (), of_command: Sequence[str] = ()
 ) -> CommandSettings:
-    """Sort the settings ``KEY=VALUE`` of a command by what they change: scenario, recipe or the command itself.
+    """Sort the settings ``KEY=VALUE`` of a command by what they change: the scenario, the recipe or the command itself.
 
-    ``recipe_keys`` and ``of_command`` are the keys of the recipe and of the command. A key that scenario and recipe
-    share is written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName`` for an unknown key, and ``InvalidInput``
-    for an ambiguous key or a bad value.
+    ``recipe_keys``, ``of_command``: valid keys of the recipe, and of the command. A key of both scenario and recipe is
+    written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName`` for an unknown key, and ``InvalidInput`` for an
+    ambiguous key or a bad value.
     """
     valid_keys = {"scenario": {*Scenario.model_fields} - NO_SETTING, "recipe": {*recipe_keys} - NO_SETTING}
     valid_keys["command"] = {*of_command}
@@ -72,10 +74,10 @@ def read_settings(
 
 
 def _expand_rules(rules: Override, overrides: Sequence[Override], owner: str) -> Override:
-    """Setting for which ``rules=NAME`` is short: ``reward.harm_count`` of a recipe, else ``harm_count``.
+    """The setting that ``rules=NAME`` abbreviates: ``reward.harm_count`` of a recipe, else ``harm_count``.
 
-    ``owner`` is ``recipe`` or another owner of settings. Raises ``InvalidInput`` for an unknown NAME, and if one of the
-    settings ``overrides`` sets the same.
+    ``owner``: what the setting changes, such as ``recipe``. Raises ``InvalidInput`` for an unknown NAME, and if one of
+    ``overrides`` changes the same key.
     """
     name, path = rules.value, ("reward", "harm_count") if owner == "recipe" else ("harm_count",)
     if not isinstance(name, str) or name not in SHORT_NAMES:

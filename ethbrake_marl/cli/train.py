@@ -121,9 +121,9 @@ def run_folder(scenario: str, recipe: str, scheme: str | None, seed: int) -> Pat
 
 
 def change_recipe(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
-    """Recipe with the command line's settings.
+    """Recipe after the command line's settings.
 
-    Print a note if they make the discount ``gamma`` and the discount of reward shaping differ.
+    Prints a note if the discount ``gamma`` then differs from the discount of reward shaping.
     """
     from ethbrake_marl.files.overrides import Override
 
@@ -144,7 +144,7 @@ def change_recipe(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRec
 def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> None:
     """Print the harm of the trained agent and of full braking, how the training ended, and how to evaluate the agent.
 
-    ``scenario`` is the name or path to print in that command; None: the name in the run's folder.
+    ``scenario``: name or path of the scenario in the printed command; None: the name in the run's folder.
     """
     from ethbrake_marl.agents.scripts import Held
     from ethbrake_marl.agents.team import Team, play_to_end
@@ -203,7 +203,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
 
 
 def tell_end(out: Out, status: str, steps: int, directory: Path) -> None:
-    """Print how the training ended, and the run's folder. Exit with status 130 if it was interrupted."""
+    """Print how the training ended, and the run's folder. Exits with status 130 if the training was interrupted."""
     if status == "interrupted":
         hint = f"the policy so far is saved; continue with: ethbrake train --resume {shlex.quote(str(directory))}"
         out.interrupted(f"interrupted after {steps:,} training steps; {hint}")

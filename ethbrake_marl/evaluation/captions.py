@@ -21,10 +21,10 @@ STAY = "\u00a0"  # a space at which no line ends
 
 
 def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
-    """Each quantity's value, or its range ``[smallest, largest]``, from columns of worlds, name -> [n].
+    """Quantities of worlds, name -> value, or ``[smallest, largest]`` if the worlds differ.
 
-    A list has one entry per vehicle or pair: ``{"gaps_m": [7.0, [5.0, 9.0]], "restitution": 0.1}``. Rates that no
-    vehicle has are left out.
+    A quantity of vehicles or pairs has a list with an entry for each of them: ``{"gaps_m": [7.0, [5.0, 9.0]],
+    "restitution": 0.1}``. ``worlds``: columns, name -> [n]. Rates that no vehicle has are left out.
     """
     ranges: dict[str, Any] = {}
     for key, rule in QUANTITIES.items():
@@ -38,7 +38,7 @@ def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def caption(parameters: Mapping[str, Any]) -> str:
-    """One line with scenario, number of worlds, seed, recordings and quantities of a table's ``parameters``."""
+    """One line with scenario, number of worlds, seed, recordings and quantities, from the ``parameters`` of a table."""
     parts = []
     for key, (symbol, unit) in SYMBOLS.items():
         if key in parameters:
@@ -53,7 +53,7 @@ def caption(parameters: Mapping[str, Any]) -> str:
 
 
 def by_recording(recordings: int) -> str:
-    """Clause for captions: from how many recordings the intervals come; "" for 0."""
+    """End of a caption: the number of traffic recordings on which the 95 % intervals rest; empty for 0 recordings."""
     if recordings == 1:
         return "; no 95 % intervals: all worlds come from one recording"
     return f"; 95 % intervals by {recordings:,} recordings" if recordings else ""

@@ -1,4 +1,4 @@
-"""Teams in the same worlds, with everything that a report about them needs."""
+"""Results of several teams in the same worlds, with everything that a report about them needs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ class Compared(NamedTuple):
         measures: Iterable[str] | str = (),
         **more: Any,
     ) -> Compared:
-        """Evaluate the teams, with ``evaluate(..., **more)``. For the count ``honest`` also measure the push."""
+        """Evaluate the teams by ``evaluate(..., **more)``, and summarise the result.
+
+        For the count ``honest`` the measure ``pushed_mps`` is added.
+        """
         names = split_names(measures) if isinstance(measures, str) and measures else [*measures]
         if harm_count == "honest":
             names.insert(0, "pushed_mps")
@@ -40,6 +43,6 @@ class Compared(NamedTuple):
         return cls(scenario, teams, result, summarise(result), harm_count)
 
     def worlds(self, rows: Iterable[int] | Ints) -> State:
-        """Worlds in some rows of the result, at the alert."""
+        """Worlds of the result with the indices ``rows``, at the alert."""
         numbers, seed = self.result.worlds["world"], self.result.about["seed"]
         return State.join([self.scenario.sample(1, seed, first=int(numbers[row])) for row in rows])

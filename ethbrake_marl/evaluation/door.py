@@ -36,13 +36,14 @@ def evaluate(
     number of processes.
 
     Args:
-        worlds: a scenario, whose evaluation list is used (a shipped name, the path or content of a file, or a
-            ``Scenario``); or worlds at the alert, which also need ``scenario``.
-        agents: names, or a mapping from your own names to names, agents, or mappings from vehicles to agents:
-            ``{"mine": agent, "both": {"vehicle_2": agent, "vehicle_3": "coast"}}``.
-        scenario: scenario of the worlds.
-        episodes: number of worlds of the list; None: 10,000.
-        seed: seed of the list; None: 7.
+        worlds: a scenario, from whose evaluation list the worlds are taken (a shipped name, the path or content of a
+            file, or a ``Scenario``); or worlds at the alert, together with ``scenario``.
+        agents: names of agents; or a mapping whose keys name the rows of the result, and whose values are names,
+            agents, or mappings from vehicles to agents: ``{"mine": agent, "both": {"vehicle_2": agent, "vehicle_3":
+            "coast"}}``.
+        scenario: scenario to which ``worlds`` belong, if they are worlds at the alert.
+        episodes: number of worlds from the evaluation list; None: 10,000.
+        seed: seed of the evaluation list; None: 7.
         harm_count: what optimising agents minimise: ``first``, as in the paper, ``total``, or ``honest``, under which
             pushing hardly pays (``episode.counts``).
         measures: names of further measures (``evaluation.named_measures``).

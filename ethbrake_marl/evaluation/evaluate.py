@@ -29,7 +29,7 @@ Columns = dict[str, MeasureValues]
 
 @dataclass(frozen=True)
 class Result:
-    """Results of teams in the same worlds: columns [n] of every team, and of the worlds. Row k is world k for all.
+    """Results of teams in the same n worlds. Entry k of every column belongs to world k.
 
     >>> import ethbrake_marl as eb
     >>> result = eb.evaluate("paper-random", "full_brake,coast", episodes=3)
@@ -39,9 +39,9 @@ class Result:
     """
 
     columns: Mapping[str, Columns]  # team -> column -> [n]: `evaluation.measures`
-    worlds: Columns  # column -> [n]: number, recording, quantities that differ, whether the channel hides something
+    worlds: Columns  # column -> [n]: number, recording, quantities that differ, ``hidden`` (`hidden_from`)
     measures: tuple[Measure, ...]
-    knows: Mapping[str, str]  # team -> what it has to know
+    knows: Mapping[str, str]  # team -> what the team must know
     policies: Mapping[str, Mapping[str, str]]  # team -> vehicle -> SHA-256 of its policy
     about: Mapping[str, Any]  # plain data: scenario, seed, times, digests, versions
 
@@ -51,7 +51,7 @@ class Result:
 
     @property
     def clusters(self) -> NDArray[np.str_] | None:
-        """Name of each world's recording, [n]; None if all worlds are independent."""
+        """Name of the traffic recording of each world, [n]; None if all worlds are independent."""
         return clusters_of(self.worlds)
 
     def __getitem__(self, team: str) -> Columns:
@@ -75,7 +75,10 @@ class Result:
         return team in self.columns
 
     def take(self, rows: Any) -> Result:
-        """Result restricted to some worlds: row numbers, or a mask [n]. Raises ``InvalidInput`` for none."""
+        """Result restricted to some worlds. ``rows``: indices of worlds, or a mask [n].
+
+        Raises ``InvalidInput`` if no world is left.
+        """
         columns = {
             team: {name: values[rows] for name, values in team_columns.items()}
             for team, team_columns in self.columns.items()
@@ -88,7 +91,7 @@ class Result:
         return replace(self, columns=columns, worlds=worlds, about=about)
 
     def arrays(self) -> Columns:
-        """Table with one row per team and world: column name -> values. Missing numbers are NaN."""
+        """Table with one row per team and world: column name -> values, [teams * n]. Missing numbers are NaN."""
         names = list(dict.fromkeys(name for team_columns in self.columns.values() for name in team_columns))
         table: Columns = {"agent": np.repeat([*self.columns], self.n)}
         table |= {name: np.tile(values, len(self.columns)) for name, values in self.worlds.items()}
@@ -120,11 +123,11 @@ def evaluate_teams(
 
     Args:
         worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State`` (without recordings).
-        agents: name in tables -> team, which drives all learners of the game.
+        agents: name in tables -> team, which controls all learners of the game.
         game: game of the worlds' scenario.
         measures: further measures, for instance ``measures_called("pushed_m,pushed_mps")``.
         jobs: number of processes.
-        about: further entries for tables and files (``identity.about_scenario``).
+        about: entries to add to ``Result.about``, usually those of ``identity.about_scenario``.
         on_done: function that is called with the number of worlds that all teams have driven so far.
 
     Raises ``InvalidInput`` for worlds that are not at the alert, for worlds or a team that do not fit the game, for
@@ -191,6 +194,7 @@ def drive_chunk(
 
 
 def _drive_team(alert: State, name: str, team: Team, game: Game, measures: Sequence[Measure]) -> Columns:
+    """Let a team drive all worlds to the end; return the columns of all measures, name -> [n]."""
     full_game, start = team.game(game), alert.read_only()
     watches: list[tuple[Measure, Watch]] = []
     for measure in measures:
@@ -218,7 +222,10 @@ def _drive_team(alert: State, name: str, team: Team, game: Game, measures: Seque
 
 
 def _join_columns(parts: Sequence[Columns]) -> Columns:
-    """Join the columns of all chunks. A column that a chunk lacks is left out."""
+    """Columns of all worlds, name -> [n], from those of consecutive chunks of worlds.
+
+    A column that a chunk lacks is left out.
+    """
     return {
         name: np.concatenate([part[name] for part in parts]) for name in parts[0] if all(name in part for part in parts)
     }
@@ -227,8 +234,8 @@ def _join_columns(parts: Sequence[Columns]) -> Columns:
 def hidden_from(alert: State, game: Game) -> Bools:
     """Whether the V2X channel hides something from a learner at its first decision, [n].
 
-    That is: the learner does not know everything about another vehicle, or a vehicle reacts later than its messages
-    say, because it waits for messages itself.
+    True if the learner lacks a quantity of another vehicle, or if another vehicle reacts later than the latency that it
+    reports, because it must first receive a message.
     """
     late, hidden = alert.car[:, LATENCY] > alert.car[:, OWN_LATENCY], np.zeros(alert.n, np.bool_)
     for i in game.settings.learners.tolist():
@@ -237,7 +244,7 @@ def hidden_from(alert: State, game: Game) -> Bools:
 
 
 def known_by(team: Team) -> str:
-    """What a team needs to know, as one text such as ``messages + true model``."""
+    """What a team must know, in words such as ``messages + true model``."""
     return " + ".join(word for word in (*KNOWLEDGE, UNSTATED) if word in _knowledge_of(team).values())
 
 

@@ -21,7 +21,10 @@ KEYS_WITHOUT_EFFECT = ("name", "title", "description", "source")  # keys of a sc
 
 
 def worlds_sha256(worlds: State) -> str:
-    """SHA-256 of worlds at the alert, from all arrays, little-endian; of ``line`` the rows before PUSHED."""
+    """SHA-256 of worlds at the alert: of the arrays ``line`` (rows before PUSHED), ``car``, ``know`` and ``wanted``.
+
+    Numbers are hashed as little-endian 64-bit floats.
+    """
     digest = hashlib.sha256()
     for array in (worlds.line[:, :PUSHED], worlds.car, worlds.know, worlds.wanted):
         digest.update(f"{array.shape}".encode())
@@ -30,7 +33,7 @@ def worlds_sha256(worlds: State) -> str:
 
 
 def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
-    """Entries about a scenario, and the seed of its worlds, for ``evaluate(about=...)``."""
+    """Entries for ``Result.about``: seed of the worlds; scripts, SHA-256 and physics of the scenario."""
     content = json.dumps(scenario.content(without=KEYS_WITHOUT_EFFECT), sort_keys=True, separators=(",", ":"))
     scripts = {name: role for name, role in scenario.roles.items() if role != "learner"}
     about = {"seed": seed, "scripts": scripts, "scenario_sha256": hashlib.sha256(content.encode()).hexdigest()}
@@ -40,13 +43,16 @@ def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
 def versions() -> dict[str, str]:
     """Name -> version of Python and of every package that affects a result, including extensions.
 
-    It also has the SHA-256 of each Python file of the user that this process ran.
+    Python files of the user that this process ran have their SHA-256 as version.
     """
     core_versions = {"python": platform.python_version()} | {name: version(name) for name in EVALUATION_PACKAGES}
     return core_versions | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 
 
 def policy_digests(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Vehicle -> SHA-256 of its policy's manifest, for policies of this package; ``drivers``: body -> agent."""
+    """Vehicle -> SHA-256 of the manifest of its policy.
+
+    ``drivers``: vehicle number -> agent. Agents without a policy of this package are left out.
+    """
     manifests = {body: getattr(getattr(agent, "policy", None), "manifest", None) for body, agent in drivers.items()}
     return {f"vehicle_{body}": manifest.manifest_sha256 for body, manifest in manifests.items() if manifest is not None}

@@ -2,8 +2,8 @@
 
 A measure is a function ``of(game, alert, last)`` of the game, the worlds at the alert and the last states of their
 episodes. It returns [n], one value per world, or [n, N], one per vehicle: columns ``NAME_1`` to ``NAME_N``. A mapping
-ending -> [n] gives the columns ``NAME_ending``, and ``NAME`` for the ending ``""``. None: not defined here. Values are
-finite numbers, truth values (tables show how often they are true) or texts.
+ending -> [n] gives the columns ``NAME_ending``, and ``NAME`` for the ending ``""``. None means that the measure is not
+defined in this game. Values are finite numbers, truth values (tables show how often they are true) or texts.
 
 =======================================  ===============================================================================
 property of a state                      meaning (``episode.state.State``)
@@ -11,8 +11,8 @@ property of a state                      meaning (``episode.state.State``)
 ``speeds_mps``, ``gaps_m``               [n, N] m/s; [n, N - 1] m, front to rear
 ``obstacle_gap_m``                       [n] m; infinite without an obstacle
 ``harm("first")``, ``harm("total")``     [n] m2/s2 of the line so far: first impact of each pair, all impacts
-``borne_harm(...)``                      [n, N] m2/s2, each vehicle's share of it
-``pair_harm(...)``                       [n, N - 1] m2/s2, of each pair
+``borne_harm(...)``                      [n, N] m2/s2 that each vehicle bears
+``pair_harm(...)``                       [n, N - 1] m2/s2 of each pair
 ``collided``, ``pair_hit``               [n]; [n, N - 1] whether there was an impact
 ``commands_mps2``, ``forces_mps2``       [n, N] m/s2: last commands; what brakes and engines cause
 ``mass_t``, ``latency_s``                [n, N] t; s
@@ -20,7 +20,7 @@ property of a state                      meaning (``episode.state.State``)
 ``braking_capacity_mps2``, ``driving_``  [n, N] m/s2 on this road
 ``time_s``, ``steps``, ``ended``         [n] s since the alert; steps taken; whether the episode has ended
 ``memories``                             body -> memory of its agent; ``"shield"`` -> memory of the shield
-``car``, ``line``                        [n, rows, N + 1] all parameters, all that changes (``motion.layout``)
+``car``, ``line``                        [n, rows, N + 1] all parameters; all changing quantities (``motion.layout``)
 =======================================  ===============================================================================
 
 A ``Watch`` also sees each step (``episode.step.Step``): ``first_impact_harm`` and ``total_harm`` of the line, [n]
@@ -52,27 +52,30 @@ AT_REST, HORIZON = "at_rest", "horizon"  # how an episode ended
 
 
 class Watch(Protocol):
-    """A measure that sees every state of the episodes."""
+    """A measure that is computed from every step of the episodes."""
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Process one step. ``step`` is None from the alert to the first decision."""
+        """Process one step from ``before`` to ``after``. ``step`` is None for the motion from the alert to the first
+        decision.
+        """
 
     def result(self, last: State) -> MeasureValue:
-        """Value, in the form that a measure returns."""
+        """Value of the measure after the episodes, in a form that a measure's function may return."""
 
 
 class Statistic(NamedTuple):
-    """How tables and JSON show a column: as a mean, as the share of worlds in which it is true, or against a baseline.
+    """Statistic of a column, for tables and JSON.
 
-    ``difference`` is the mean difference, ``decrease`` is 1 - (mean) / (mean of the baseline).
+    The kind ``rate`` is the share of worlds in which the column is true, ``difference`` the mean difference from the
+    baseline, ``decrease`` 1 - (mean) / (mean of the baseline).
     """
 
-    key: str  # in JSON
+    key: str  # name in JSON
     kind: Literal["mean", "rate", "difference", "decrease"] = "mean"
-    heading: str = ""  # in tables; "": not in tables
+    heading: str = ""  # in tables; "": left out of tables
     short: str = ""  # heading in a terminal
-    ending: str = ""  # of the column's name, after the measure's
-    meaning: str = ""  # "": that of the measure
+    ending: str = ""  # what follows the measure's name in the column's name
+    meaning: str = ""  # "": the measure's meaning
 
 
 class Measure(NamedTuple):
@@ -80,14 +83,14 @@ class Measure(NamedTuple):
     of: Callable[[Game, State, State], MeasureValue] | None = None
     meaning: str = ""
     unit: str = "1"
-    statistics: tuple[Statistic, ...] = ()  # statistics of its columns; any other column has a mean or rate of its name
-    watch: Callable[[Game, State], Watch | None] | None = None  # begins with (game, alert)
+    statistics: tuple[Statistic, ...] = ()  # of its columns; a column without any gets its mean or rate
+    watch: Callable[[Game, State], Watch | None] | None = None  # makes a `Watch` from (game, alert)
 
 
 def measure_columns(measure: Measure, measurement: MeasureValue, last: State) -> dict[str, MeasureValues]:
-    """Columns of a measure, name -> [n], from its value ``measurement``.
+    """Columns of a measure, name -> [n], from the value that the measure returned.
 
-    Raises ``InvalidInput`` for a wrong shape or type.
+    Raises ``InvalidInput`` for a wrong shape or type, and for numbers that are not finite.
     """
     if measurement is None:
         return {}
@@ -120,9 +123,9 @@ def collided(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 def harm(count: str, game: Game, alert: State, last: State) -> MeasureValue:
-    """Harm of the line (ending ``""``) and of each vehicle (``1`` to ``N``), [n] each, in a count of harm.
+    """Harm at the end, [n] m2/s2: key ``""`` for the line, ``"1"`` to ``"N"`` for what each vehicle bears.
 
-    None for the honest cost if impacts are not exact.
+    None for the honest cost if the physics has no exact impacts.
     """
     if count == "honest" and not last.is_exact:
         return None
@@ -151,14 +154,18 @@ def ended(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 def predicted_harm(game: Game, alert: State, last: State) -> MeasureValue:
-    """Harm that the only predicting agent or shield predicted at the alert, in the count that it minimises."""
+    """Harm that an agent or a shield predicted at the alert, in the count that it minimises. Defined if exactly one of
+    them predicts.
+    """
     memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.settings.learners.tolist())]
     predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
     return predictions[0] if len(predictions) == 1 and np.isfinite(predictions[0]).all() else None
 
 
 def replaced(game: Game, alert: State, last: State) -> MeasureValue:
-    """actions: number the shield replaced; none: whether it replaced none, or let the policy drive (Algorithm 1)."""
+    """actions: number of actions that the shield replaced; none: whether it replaced none or, if it chooses once per
+    episode (Algorithm 1), chose the policy.
+    """
     memory: Any = last.memories.get("shield")
     if hasattr(memory, "chosen"):
         return {"none": memory.chosen}
@@ -214,7 +221,7 @@ DEFAULT = (
 
 @contextmanager
 def naming(measure: Measure) -> Iterator[None]:
-    """Turn an error in the block into an ``InvalidInput`` that names the measure."""
+    """Turn an exception in the block into an ``InvalidInput`` that names the measure; errors of this package pass."""
     try:
         yield
     except EthBrakeError:

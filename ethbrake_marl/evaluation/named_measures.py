@@ -1,7 +1,7 @@
 """Measures by name: registered ones, summed terms of a reward, objectives, functions of a user's Python file.
 
-The sum of a term over all steps is what a learner with this reward would get (``episode.terms``). An objective
-(``social:45``) has a value in each count of harm, for each vehicle if it differs between them.
+The sum of a term over all steps is what a learner with this reward would get (``episode.terms``). An objective such as
+``social:45`` is measured in every count of harm, and for each vehicle if it differs between vehicles.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def register_measure(
     statistics: Iterable[Statistic] = (),
     watch: Callable[[Game, State], Watch | None] | None = None,
 ) -> None:
-    """Register a measure, for ``measures_called``. Entry points: ``ethbrake_marl.measures``.
+    """Register a measure under a name. Packages declare measures as entry points ``ethbrake_marl.measures``.
 
     The docstring of the function describes the measure. Raises ``AlreadyExists`` for a name in use, and
     ``InvalidInput`` for a bad name or a missing docstring.
@@ -44,9 +44,9 @@ def register_measure(
     Args:
         name: 1 to 64 characters ``a-z``, ``0-9``, ``_``, beginning with a letter, not ending in ``_`` and a number, nor
             in ``_interval``, ``_low``, ``_high``, ``_error``, ``_freedom``.
-        of: ``of(game, alert, last)`` returns [n] or [n, N].
-        unit: unit of the value.
-        statistics: how tables show it; by default the mean, or the share of worlds in which it is true.
+        of: function ``of(game, alert, last)``, whose value is described in ``evaluation.measures``.
+        unit: unit of the values.
+        statistics: how tables show the measure; by default its mean, or the share of worlds in which it is true.
         watch: instead of ``of``: ``watch(game, alert)`` returns a ``Watch``, which sees every step.
 
     >>> import ethbrake_marl as eb
@@ -102,15 +102,15 @@ _REWARDED: dict[str, TermFunction] = {
 
 
 def split_names(names: str) -> list[str]:
-    """Split a list of names at its commas, but not within an objective such as ``weighted:1,4,1``."""
+    """Names in a text, split at commas, except those within an objective such as ``weighted:1,4,1``."""
     return re.split(r",(?!then:|\s*[\d.][\d.e+-]*(?:,|$))", names)
 
 
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
-    """Measures, summed terms and objectives with these names, each once. ``FILE.py:NAME`` runs the file.
+    """Measures with these names, without duplicates: registered measures, summed terms of a reward, objectives.
 
-    A measure from a file is called ``NAME``, or ``FILE.py:NAME`` if another one is called ``NAME``. Raises
-    ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
+    ``FILE.py:NAME`` runs the file and takes its measure NAME, which is called ``FILE.py:NAME`` if two measures of the
+    result would be called ``NAME``. Raises ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
     """
     if not isinstance(names, Iterable):
         raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'pushed_mps,pushed_m'")
@@ -141,6 +141,7 @@ def _qualify_measure(name: str, measure: Measure) -> Measure:
 
 
 def _measures_named(name: str) -> list[Measure]:
+    """Measures that one name stands for; more than one if the name is an entry point with several measures."""
     if name in MEASURES and name in TERMS:
         raise AlreadyExists(f"measure {name!r}: a measure and a term of the reward have this name; rename one of them")
     if name in MEASURES:
@@ -161,6 +162,7 @@ def _measures_named(name: str) -> list[Measure]:
 
 
 def _of_file(file: str, name: str) -> Measure:
+    """Measure ``name`` of a user's Python file: a function, or a ``Part`` with arguments of ``register_measure``."""
     value = load_from_file(file, name)
     part = value if isinstance(value, Part) else Part(value)
     try:
@@ -179,7 +181,7 @@ def _sum_of_term(name: str, term: TermFunction, unit: str) -> Measure:
 
 
 def _intervention(before: State, step: Step, after: State) -> Floats:
-    """Term intervention (``shields.shield``), but 0 without a shield, so that a table can compare both."""
+    """Term ``intervention`` of the reward (``shields.shield``); 0 without a shield, so that tables can compare both."""
     if "shield" not in after.memories:
         return np.zeros(after.speeds_mps.shape)
     return TERMS["intervention"].value(before, step, after)
@@ -199,7 +201,7 @@ class SummedTerm:
         self.term, self.sum = term, np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Add the term of one step, 0 in episodes that ended before."""
+        """Add the term of one step; 0 for episodes that had ended before."""
         if step is not None:
             value = self.term(before, step, after)
             ended = before.ended if value.ndim == 1 else before.ended[:, np.newaxis]

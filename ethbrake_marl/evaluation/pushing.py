@@ -1,4 +1,4 @@
-"""Measures of conduct without harm: pushes, driving before the first impact, and motion at the end."""
+"""Measures of dangerous conduct besides impacts: pushes, driving before the first impact, motion at the end."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ethbrake_marl.evaluation.summary_row import PUSHED_FAR_M
 from ethbrake_marl.motion.layout import FAR_M, GAP, IMPACTS, LATENCY, NEXT_TIME, PUSHED, Floats, scratch_for
 from ethbrake_marl.registry import Part
 
-POST_M = 1e5  # distance of a post that nobody reaches, from which ways are measured to 1e-10 m
+POST_M = 1e5  # distance to an imaginary post that no vehicle reaches; its gap gives distances to 1e-10 m
 HARD_MPS2 = 1.0  # a command above this is hard driving
 
 
 def own_way_m(alert: State, body: int, until_s: float) -> Floats:
-    """Distance that a vehicle travels until ``until_s`` if nobody touches it, [n] m."""
+    """Distance that a vehicle travels from the alert to ``until_s`` if no other vehicle touches it, [n] m."""
     check_exact(alert, "pushed_m")
     line, wanted = alert.line[:, :, [0, body]], alert.wanted[:, [0, body]]
     line[:, GAP, 0], line[:, GAP, 1] = POST_M, np.inf
@@ -28,9 +28,9 @@ def own_way_m(alert: State, body: int, until_s: float) -> Floats:
 
 
 def with_post(state: State) -> Floats:
-    """Copy of ``state.line`` in which Vehicle 1 has something ahead: without an obstacle, a far post.
+    """Copy of ``state.line`` with an imaginary post far ahead of Vehicle 1 unless an obstacle is there.
 
-    Its gap to Vehicle 1 shows how far Vehicle 1 moves.
+    The gap ahead of Vehicle 1 then shows how far the vehicle moves.
     """
     line = state.line.copy()
     line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
@@ -38,9 +38,9 @@ def with_post(state: State) -> Floats:
 
 
 class PushedAway:
-    """A ``Watch`` of the distance that vehicles travel, minus the distance until the horizon if nobody touched them.
+    """A ``Watch`` that measures how far vehicles end beyond the place they would reach by the horizon if untouched.
 
-    It is negative if the vehicle ends nearer, for instance because an obstacle threw it back.
+    Negative if a vehicle ends short of that place, for instance because an obstacle threw it back.
     """
 
     def __init__(self, bodies: list[int], game: Game, alert: State) -> None:
@@ -48,7 +48,7 @@ class PushedAway:
         self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Add the distance of Vehicle 1. Without an obstacle, the step is simulated again ``with_post``."""
+        """Add the distance that Vehicle 1 travels in this step, which is simulated again (``with_post``)."""
         line = with_post(before)
         from_m = line[:, GAP, 0].copy()
         times = np.ascontiguousarray(before.time_s), np.ascontiguousarray(after.time_s)
@@ -56,7 +56,7 @@ class PushedAway:
         self.way_m += from_m - line[:, GAP, 0]
 
     def result(self, last: State) -> MeasureValue:
-        """Distance of each vehicle (m), and whether that of Vehicle 1 is above ``PUSHED_FAR_M``."""
+        """Excess distance, vehicle number -> [n] m; ``1_far``: whether Vehicle 1's exceeds ``PUSHED_FAR_M``, [n]."""
         wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
         metres = {
             f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - untouched_m
@@ -66,17 +66,17 @@ class PushedAway:
 
 
 def pushed_m(game: Game, alert: State) -> PushedAway | None:
-    """How far a vehicle ends beyond the place where it would stop by itself, by impacts and by pushes. In reality it
-    brakes for something, so this is dangerous. Defined for vehicles that neither learn nor look at the state.
+    """How far a vehicle ends beyond the place where it would stop untouched, because of impacts and pushes. In reality
+    it brakes for something, so this is dangerous. Defined for vehicles that neither learn nor observe the state.
     """
     bodies = [i for i in range(1, alert.vehicles + 1) if i not in game.settings.learners and i not in game.scripts]
     return PushedAway(bodies, game, alert) if bodies else None
 
 
 def pushed_mps(game: Game, alert: State, last: State) -> MeasureValue:
-    """Push: closing speed that vehicles build up and contacts take up, as long as a contact lasts and in the impacts
-    after a pair's first. Of the whole line; with the number of a vehicle: by the vehicle behind it; obstacle: by
-    Vehicle 1 against the obstacle.
+    """Push: closing speed that vehicles build up and contacts absorb, while a contact lasts and in the impacts after a
+    pair's first. Without a number: sum over the line; with the number of a vehicle: push by the vehicle behind it;
+    obstacle: push of Vehicle 1 against the obstacle.
     """
     check_exact(last, "pushed_mps")
     of_pair = last.line[:, PUSHED]
@@ -85,9 +85,10 @@ def pushed_mps(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 def first_impact_s(before: State, after: State) -> Floats:
-    """Time of the line's first impact, [n] s; ``before.time_s`` if it was earlier, ``after.time_s`` if later or never.
+    """Time of the line's first impact if it lies between the two states, [n] s.
 
-    There must be no decision between the two states.
+    ``before.time_s`` if it was earlier, ``after.time_s`` if it is later or never. There must be no decision between the
+    two states.
     """
     until: Floats = np.where(before.collided, before.time_s, after.time_s)
     for k, scratch in simulate_again(before, after, ~before.collided & after.collided):
@@ -97,13 +98,18 @@ def first_impact_s(before: State, after: State) -> Floats:
 
 
 def driving_s(before: State, after: State, until_s: Floats) -> Floats:
-    """Time from ``before`` to ``until_s`` [n] with a positive command in force, [n, N] s."""
+    """Time between ``before`` and ``until_s`` [n] in which each vehicle has a positive command in force, [n, N] s.
+
+    ``after``: the state after the step, which holds the commands.
+    """
     begun_s = np.maximum(before.car[:, LATENCY, 1:], before.time_s[:, np.newaxis])
     return np.where(after.commands_mps2 > 0.0, np.maximum(until_s[:, np.newaxis] - begun_s, 0.0), 0.0)
 
 
 class DroveTowards:
-    """Watches the time before each line's first impact, and the part of it with a positive command."""
+    """Measures the share of the time before a line's first impact in which each vehicle has a positive command
+    (drives).
+    """
 
     def __init__(self, game: Game, alert: State) -> None:
         self.learners, self.time_s = game.settings.learners, np.zeros(alert.n)
@@ -124,9 +130,9 @@ class DroveTowards:
 
 
 def drove_towards(game: Game, alert: State) -> DroveTowards:
-    """Share of the time before the line's first impact (without one: of the episode) in which a positive command was
-    in force. With the number of a vehicle: its own, otherwise the largest of the learners; hard: whether a learner
-    drove at more than 1 m/s2.
+    """Share of the time before the line's first impact (of the whole episode, if there is none) in which a vehicle has
+    a positive command (drives). With the number of a vehicle: for this vehicle; without: the largest share of a
+    learner; hard: whether a learner drove at more than 1 m/s2.
     """
     return DroveTowards(game, alert)
 

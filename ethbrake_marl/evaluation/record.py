@@ -37,12 +37,12 @@ SAMPLE_S = 0.02  # usual time between two samples
 
 @dataclass(frozen=True)
 class Impacts:
-    """Impacts of one episode in order of time. Several impacts of a pair between two samples are one row."""
+    """The m impacts of one episode, in order of time. Several impacts of a pair between two samples are one entry."""
 
-    time_s: Floats  # [m] of the first
+    time_s: Floats  # [m] of the first impact in the entry
     pair: Ints  # [m] 0: Vehicle 1 with the obstacle, p: vehicle_p and the one behind it
-    closing_speed_mps: Floats  # [m] of the first
-    number: Ints  # [m]
+    closing_speed_mps: Floats  # [m] of the first impact in the entry
+    number: Ints  # [m] of impacts in the entry
     first_impact_harm: Floats  # [m] m2/s2
     total_harm: Floats  # [m] m2/s2
 
@@ -109,13 +109,14 @@ def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPL
 
 
 def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> list[EpisodeRecord]:
-    """Record several worlds, which a team drives together (``record_episode``)."""
+    """Records of several worlds that a team drives, one per world, as by ``record_episode``."""
     check_exact(worlds, "a record of the motion between decisions")
     states = [worlds, *(state for _, state in play(game, worlds, team))]
     return [_record_of([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]
 
 
 def _record_of(states: list[State], team: Team, game: Game, sample_s: float) -> EpisodeRecord:
+    """Record of one world, from its states at the alert and at every decision. States after the end are left out."""
     until = 2 + sum(not state.ended[0] for state in states[1:])
     states, world = states[:until], states[0]
     pieces = [_motion_pieces(before, after, sample_s) for before, after in pairwise(states)]
@@ -136,10 +137,10 @@ def _record_of(states: list[State], team: Team, game: Game, sample_s: float) -> 
 
 
 def _motion_pieces(before: State, after: State, sample_s: float) -> tuple[Floats, Floats, Floats]:
-    """Pieces of the motion between two decisions of one world, each at most ``sample_s`` long.
+    """Motion of one world between two decisions, cut into k pieces of at most ``sample_s``.
 
-    They are times [k, 2], lines [k, 2, ...] at both ends, and commands [k, N + 1]. Without an obstacle, a post far
-    ahead shows how far Vehicle 1 has moved.
+    Returns times [k, 2] (s) and lines [k, 2, rows, N + 1] at both ends of each piece, and commands [k, N + 1] (m/s2).
+    Without an obstacle, a post far ahead shows how far Vehicle 1 has moved.
     """
     start, end = float(before.time_s[0]), float(after.time_s[0])
     count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
@@ -153,9 +154,9 @@ def _motion_pieces(before: State, after: State, sample_s: float) -> tuple[Floats
 
 
 def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impacts:
-    """Impacts in pieces of the motion (``_motion_pieces``).
+    """Impacts in the pieces that ``_motion_pieces`` returns.
 
-    Pieces with impacts are simulated again, for the time of the first one.
+    A piece with impacts is simulated again to get time and closing speed of each pair's first.
     """
     rows = [FIRST, TOTAL, IMPACTS]
     increase = lines[:, 1, rows] - lines[:, 0, rows]

@@ -1,4 +1,4 @@
-"""Parts of an episode, simulated again for what its states do not say."""
+"""Simulates parts of an episode again, for quantities that its states do not hold."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from ethbrake_marl.motion.layout import Bools, Floats, scratch_for
 
 
 def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wanted: Floats, scratch: Floats) -> int:
-    """Advance every world from ``time`` to ``until`` [n] (s), ``line`` in place; return a failed row, or -1.
+    """Advance every world from ``time`` to ``until`` (s, [n] each); change ``line`` in place.
 
-    The other arrays are described in ``motion.layout``; all vehicles hold the commands ``wanted`` [n, N + 1] (m/s2).
+    Returns the index of a world in which the simulation failed, or -1. All vehicles hold the commands ``wanted`` [n, N
+    + 1] (m/s2); the other arrays are described in ``motion.layout``.
     """
     moved = line.copy()  # arrays of any layout become alike, because a kernel is compiled for each layout
     failed: int = move_lines(moved, car.copy(), time.copy(), until.copy(), wanted.copy(), scratch)
@@ -23,9 +24,10 @@ def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wante
 
 
 def simulate_again(before: State, after: State, rows: Bools) -> Iterator[tuple[int, Floats]]:
-    """Simulate ``rows`` worlds [n] again from ``before`` to ``after``; yield each row and the physics' scratch memory.
+    """Simulate the worlds in the mask ``rows`` [n] again, from ``before`` to ``after``, one after the other.
 
-    There must be no decision between the states.
+    Yields the index of each world, and the scratch memory that the physics has filled (``motion.layout``). There must
+    be no decision between the two states.
     """
     check_exact(before, "a quantity of single impacts")
     scratch = scratch_for(after.vehicles + 1)

@@ -35,8 +35,8 @@ def write_results(
 ) -> list[Path]:
     """Write ``FOLDER/results.json`` and, with ``rows``, ``FOLDER/worlds.csv`` or ``.parquet``; return their paths.
 
-    ``name`` is another name for the first file. Raises ``AlreadyExists`` if a file exists, unless ``force``, and
-    ``MissingExtra`` for Parquet without pyarrow.
+    ``name`` renames the first file. Raises ``AlreadyExists`` if a file exists, unless ``force``, and ``MissingExtra``
+    for Parquet without pyarrow.
     """
     target, objects = Path(folder).expanduser(), table.to_json()
     written = [check_target(target / name, force=force)]
@@ -82,9 +82,9 @@ def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None
 
 
 def read_result(path: str | Path) -> dict[str, dict[str, Any]]:
-    """Team -> its object in ``results.json``.
+    """Content of a ``results.json``: team -> JSON object.
 
-    Raises ``InvalidInput`` for any other file, and for one that was edited or damaged.
+    Raises ``InvalidInput`` for any other file, and for a file that was edited or damaged.
     """
     file = Path(path).expanduser()
     data = read_plain(file, MOST_BYTES)

@@ -78,8 +78,8 @@ def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
 
     The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width ``z sqrt(p (1 - p) / n + z^2 /
     (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of independent worlds with the same standard error, ``1 +
-    p (1 - p) / error^2``, at most the number of worlds, times ``(z / t)^2`` (Korn and Graubard 1998). If all worlds are
-    alike, it is ``1 / sum h_g^2`` times ``(z / t)^2``.
+    p (1 - p) / error^2``, at most the number of worlds, times ``(z / t)^2`` (Korn and Graubard 1998). If p is 0 or 1, n
+    is ``1 / sum h_g^2`` times ``(z / t)^2``.
     """
     share, n = int(np.count_nonzero(truths)) / len(truths), float(len(truths))
     error: float | None = sqrt(share * (1.0 - share) / n)
@@ -97,7 +97,7 @@ def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
 
 
 def wilson(share: float, count: float) -> tuple[float, float]:
-    """Wilson's interval for a share of ``count`` independent draws (``count`` may be a fraction)."""
+    """Wilson's 95 % interval for a share in ``count`` independent draws; ``count`` need not be a whole number."""
     shrink = 1.0 + Z * Z / count
     centre = (share + Z * Z / (2.0 * count)) / shrink
     half = Z / shrink * sqrt(share * (1.0 - share) / count + Z * Z / (4.0 * count * count))
@@ -107,8 +107,8 @@ def wilson(share: float, count: float) -> tuple[float, float]:
 def unpaired(value: Estimate, baseline: Estimate) -> Estimate:
     """Difference of two means over different worlds, with Welch's interval.
 
-    Its squared error is ``s1^2 + s2^2``, with ``s^4 / (s1^4 / f1 + s2^4 / f2)`` degrees of freedom. If a standard error
-    is unknown, there is no interval.
+    With standard errors s1, s2 and degrees of freedom f1, f2 of the means, the error s of the difference is ``sqrt(s1^2
+    + s2^2)`` with ``s^4 / (s1^4 / f1 + s2^4 / f2)`` degrees of freedom. If s1 or s2 is unknown, there is no interval.
     """
     contrast = value.value - baseline.value
     if value.error is None or baseline.error is None or not value.freedom or not baseline.freedom:
@@ -154,7 +154,7 @@ def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[Any]) -> t
 def _spread(residuals: Floats, weights: Floats, total: float) -> tuple[float, float, float] | tuple[None, None, None]:
     """Standard error, degrees of freedom and skewness of a ratio, from each recording's sums [G].
 
-    ``total`` is the sum of all weights. None: one recording has nearly all of it.
+    ``total`` is the sum of all weights. All three are None if one recording has nearly all the weight.
     """
     groups, share = len(residuals), weights / total
     rest = 1.0 - share
@@ -167,10 +167,10 @@ def _spread(residuals: Floats, weights: Floats, total: float) -> tuple[float, fl
 
 
 def _freedom(share: Floats, scale: Floats) -> float:
-    """Satterthwaite's ``tr(K)^2 / tr(K^2)``, with ``K_gk = scale_g^.5 C_gk scale_k^.5`` and, for the shares h,
+    """Satterthwaite's ``tr(K)^2 / tr(K^2)``, where ``K_gk = scale_g^.5 C_gk scale_k^.5``.
 
-    ``C_gk = (g = k) h_g^2 - h_g h_k (h_g + h_k - sum h^2)``: the covariance of the deviations from the common ratio if
-    each recording's own deviation has the variance h_g^2.
+    ``C_gk = (g = k) h_g^2 - h_g h_k (h_g + h_k - sum h^2)`` for the shares h: the covariance of the deviations from the
+    common ratio if the deviation of recording g has the variance h_g^2.
     """
     square = fsum(share * share)
     two, three, four = (fsum(scale * share**power) for power in (2, 3, 4))

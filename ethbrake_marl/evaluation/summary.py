@@ -23,7 +23,7 @@ IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
 COMPARE = {"difference": statistics.difference, "decrease": statistics.decrease}
 _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
-FIRST_COLUMNS = ("collision_rate", *COLUMN.values())  # their intervals stand below the values
+FIRST_COLUMNS = ("collision_rate", *COLUMN.values())  # columns whose intervals stand below the values
 
 HEADINGS = {
     "Agent": "The agent that controls the vehicle. All other vehicles follow the scripts of the scenario. full_brake is"
@@ -88,7 +88,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
 
     def measures(self) -> Sheet | None:
-        """Table of measures without a column of their own, or None."""
+        """Table of additional measures without a column in the main table; None if there are none."""
         labels = {
             key: f"{key} ({measure.unit})" if measure.unit and statistic.kind != "decrease" else key
             for key, (measure, statistic) in self.statistics.items()
@@ -124,7 +124,7 @@ class SummaryTable(list[SummaryRow]):
         return notes
 
     def meanings(self) -> dict[str, str]:
-        """Heading -> meaning of the column; for measures without a column, name -> meaning."""
+        """Heading of a column -> its meaning; for a measure without a column, name of the measure -> meaning."""
         texts = {
             statistic.heading: statistic.meaning or measure.meaning
             for measure, statistic in self.statistics.values()
@@ -138,7 +138,7 @@ class SummaryTable(list[SummaryRow]):
         }
 
     def to_json(self) -> list[dict[str, Any]]:
-        """One object per team, with the result's digests, versions and ``parameters``."""
+        """One JSON object per team, with the result's digests, versions and ``parameters``."""
         identity = {key: self.parameters[key] for key in IDENTITY if key in self.parameters}
         parameters = {key: value for key, value in self.parameters.items() if key not in IDENTITY}
         return [{"kind": "evaluate", **row.to_json(), **identity, "parameters": parameters} for row in self]
@@ -198,7 +198,7 @@ def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
 
 
 def _statistics_of(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
-    """Key of an estimate -> its column, measure and statistic, with comparisons and predictions last."""
+    """Statistics of a table, key -> column, measure and statistic; comparisons and predictions come last."""
     entries: dict[str, tuple[str, Measure, Statistic]] = {}
     kinds = {
         name: column.dtype.kind for team_columns in result.columns.values() for name, column in team_columns.items()
@@ -224,6 +224,7 @@ def _sort_position(entry: tuple[str, tuple[str, Measure, Statistic]]) -> int:
 def _estimate(
     statistic: Statistic, values: MeasureValues | None, baseline: MeasureValues | None, clusters: NDArray[Any] | None
 ) -> Estimate | None:
+    """Estimate of a statistic, from a team's column and the baseline's, [n] each; None if one of them is missing."""
     if values is None or (statistic.kind in COMPARE and baseline is None):
         return None
     if statistic.kind == "rate":
@@ -238,7 +239,8 @@ def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[s
     """One table for each group of worlds, in alphabetical order.
 
     ``by`` is ``scenario`` (in a mixture), ``recording``, or a vehicle's type such as ``vehicle_2_type``; ``baseline``
-    as in ``summarise``. Raises ``InvalidInput`` if the worlds have no groups, ``UnknownName`` for another name.
+    as in ``summarise``. Raises ``InvalidInput`` if the worlds have no groups, and ``UnknownName`` if ``by`` is none of
+    these.
     """
     kinds = {name: column for name, column in result.worlds.items() if column.dtype.kind == "U"}
     if not kinds:
@@ -254,9 +256,9 @@ def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[s
 
 
 def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Result]) -> Sheet:
-    """One table of several evaluations, such as the tests of a standard: a section for each, a row per team.
+    """One table of several evaluations, such as the tests of a standard: a section per evaluation, a row per team.
 
-    A team passes a test if there is no impact in any world.
+    A team passes a test if no world has an impact.
     """
     columns: list[Column | str] = [
         Column("Agent", "agent", text=True), Column("Result", "result"),

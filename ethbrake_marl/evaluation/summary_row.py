@@ -11,8 +11,8 @@ from ethbrake_marl.errors import unknown_name
 from ethbrake_marl.files.sheet import Estimate
 
 SEES_THROUGH, EXPLOITS = "†", "‡"  # marks of teams
-PUSHED_FAR_M = 5.0  # way by which Vehicle 1 counts as pushed far; as a mean over all worlds it is an exploit
-MOVING_SHARE = 0.05  # share of worlds moving at the horizon that is an exploit
+PUSHED_FAR_M = 5.0  # Vehicle 1 counts as pushed far above this distance; a mean above it is an exploit
+MOVING_SHARE = 0.05  # an exploit if a vehicle still moves at the horizon in a larger share of worlds
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,10 @@ class SummaryRow:
 
     @property
     def exploits(self) -> dict[str, str]:
-        """Damage that is not counted as harm -> its size in words: ``pushes`` Vehicle 1, ``moving`` at the horizon."""
+        """Exploits: conduct that harm does not count, name -> its size in words.
+
+        ``pushes``: the team pushes Vehicle 1 far. ``moving``: a vehicle often still moves at the horizon.
+        """
         pushed, moving = self.estimates.get("pushed_m_1"), self.horizon_ends / self.episodes
         words = {}
         if pushed is not None and pushed.value > PUSHED_FAR_M:
@@ -62,7 +65,7 @@ class SummaryRow:
         return f"{self.agent} {EXPLOITS}" if self.exploits else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Each estimate with interval, standard error and degrees of freedom; None if unknown."""
+        """Row as plain data: each estimate with interval, standard error and degrees of freedom; None if unknown."""
         plain: dict[str, Any] = {
             "agent": self.agent, "knows": self.knows, "sees_through_channel": self.sees_through,
             "hidden_share": self.hidden_share, "episodes": self.episodes, "collisions": self.collisions,

@@ -1,4 +1,4 @@
-"""Try a scenario before use: what its worlds are like, which vehicles know each other, and what can be learned."""
+"""Try a scenario before use: what its worlds are like, what vehicles know of each other, and what can be learned."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ class Trial(NamedTuple):
 
 
 def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
-    """Simulate 200 worlds. Raises the errors of scripts, which name vehicle, world and time.
+    """Simulate the first 200 worlds of the evaluation list, once with each agent of ``COMPARED`` as the learners.
 
-    ``count`` is the harm that ``best constant deceleration`` and ``best known`` minimise.
+    ``count`` is the harm that ``best constant deceleration`` and ``best known`` minimise. Raises the errors of scripts,
+    which name vehicle, world and time.
     """
     loaded, game = open_game(scenario)
     draw = loaded.draw(WORLDS, SEED)
@@ -73,7 +74,7 @@ def _to_the_end(game: Game, state: State) -> State:
 
 
 def _known_shares(scenario: Scenario, state: State) -> dict[str, dict[str, float]]:
-    """For each learner, the share of worlds in which it knows each other vehicle when it can first act."""
+    """Learner -> other vehicle -> share of worlds in which the learner knows that vehicle when it can first act."""
     names: Any = scenario.vehicle_names
     acts_s = np.maximum(state.time_s[:, np.newaxis], state.latency_s)
     return {

@@ -1,1 +1,1 @@
-"""File formats: files are read strictly, and written completely or not at all."""
+"""Files and their formats: read strictly, and written completely or not at all."""

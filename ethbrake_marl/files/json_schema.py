@@ -11,7 +11,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 class FileSchema(GenerateJsonSchema):
-    """JSON Schema generator without ``null`` values: in a file, a key without a value is left out."""
+    """JSON Schema generator that allows no ``null``: in these files, a key without a value is left out."""
 
     def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
         return self.generate_inner(schema["schema"])

@@ -53,10 +53,10 @@ UNSHOWN = object()  # passed as a value, means: do not show the value in the err
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    """Raise, inside a pydantic validator, the error for an invalid ``value``.
+    """Raise the error for an invalid ``value``, inside a pydantic validator.
 
-    ``at`` is the path of the value inside the validated field (``()``: the field itself). ``right`` says what would be
-    valid, for example ``must be above 0``.
+    ``at``: path of the value inside the validated field (``()``: the field itself). ``right``: what would be valid,
+    such as ``must be above 0``.
     """
     value_text = "" if value is UNSHOWN else flow_text(value, 60)
     raise PydanticCustomError("refused", "{right}", {"right": right, "value": value_text, "at": at})
@@ -68,13 +68,13 @@ def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
 
 
 class Wording:
-    """Parts of error messages for one kind of file; subclasses override them. An empty text is left out."""
+    """Parts of error messages for one kind of file, which subclasses override. An empty text is left out."""
 
     def __init__(self, model: type[BaseModel], needed: str = "") -> None:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
-        """Valid keys in place of the last key of ``path``."""
+        """Keys that would be valid in place of the last key of ``path``."""
         models = [self.model]
         for key in path[:-1]:
             inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
@@ -90,16 +90,16 @@ class Wording:
         return ""
 
     def owner(self, path: YamlPath) -> str:
-        """Vehicle or pair that the value at ``path`` describes."""
+        """Name of the vehicle or pair that the value at ``path`` describes."""
         return ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """What would be valid in place of a value that pydantic rejects; empty: a general text is used."""
+        """Text about what would be valid in place of a value that pydantic rejects; empty: use the general text."""
         return ""
 
 
 def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
-    """Error for the first mistake that pydantic reports, or for the first unknown key if there is one."""
+    """Error to raise: for the first unknown key, or without one for the first mistake that pydantic reports."""
     # A default that depends on an invalid field is no mistake of its own.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
     detail = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
@@ -116,7 +116,7 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
-    """Read a YAML file or document into ``model``; raise ``InvalidInput`` for the first mistake.
+    """Content of a YAML file or document, as ``model``. Raises ``InvalidInput`` for the first mistake.
 
     ``advice`` ends the message "must be a mapping ..." for a file without a mapping.
     """
@@ -130,7 +130,7 @@ def read_model(source: str | Path | Document, model: type[Model], wording: Wordi
 
 
 def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
-    """Content of a JSON file, as plain data and as ``model``. Raises ``ValueError`` with a one-line reason."""
+    """Content of a JSON file, as plain data and as ``model``. Raises ``ValueError`` with the reason on one line."""
     content = parse_strict_json(data)  # refuses repeated keys and NaN
     try:
         return content, model.model_validate_json(data)
@@ -139,7 +139,7 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 
 
 class Mistake(NamedTuple):
-    """A mistake in data from a program. As text it says where it is and what would be valid."""
+    """A mistake in data from a program. Its text says where the mistake is and what would be valid."""
 
     place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
     given: Any  # the invalid value
@@ -156,15 +156,16 @@ def first_mistake(error: ValidationError) -> Mistake:
 
 
 def path_of(detail: ErrorDetails) -> YamlPath:
-    """Path, inside the file, of a mistake that pydantic reports.
+    """Path, in the file, of a mistake that pydantic reports.
 
-    Tags of unions are removed. If ``refuse`` raised the error, its ``at`` is appended.
+    Pydantic's tags of unions are removed. If ``refuse`` raised the error, its argument ``at`` is appended.
     """
     keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
     return (*keys, *detail.get("ctx", {}).get("at", ()))
 
 
 def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
+    """Message about a mistake: place, invalid value, and what would be valid."""
     place = _place(path, wording)
     if detail["type"] == "extra_forbidden":
         inside = wording.known(path)
@@ -181,7 +182,7 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 
 
 def _show(detail: ErrorDetails) -> str:
-    """Text of the invalid value, or "" for a whole file. A float in place of an integer keeps its point."""
+    """Text of the invalid value, empty for a whole file. A float where an integer is needed keeps its point."""
     value = detail["input"]
     if isinstance(value, BaseModel) or not detail["loc"]:
         return ""
@@ -202,6 +203,7 @@ def _unquote(detail: ErrorDetails) -> str:
 
 
 def _right(detail: ErrorDetails) -> str:
+    """General text about what would be valid."""
     kind = detail["type"]
     if detail["input"] != detail["input"]:  # NaN
         return "must be a finite number"
@@ -224,9 +226,9 @@ def _right(detail: ErrorDetails) -> str:
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:
-    """Text "did you mean ...?" or "renamed to ..." for an unknown ``key``, or "" if no known key is similar.
+    """Text "did you mean ...?" or "renamed to ..." for an unknown ``key``; empty if no known key is similar.
 
-    It also recognises a key with a wrong or missing unit, such as ``gaps_km`` or ``mass``.
+    A key with a wrong or missing unit, such as ``gaps_km`` or ``mass``, is also recognised.
     """
     if renamed := new_name(key):
         return renamed

@@ -26,16 +26,16 @@ class Override:
 
     @property
     def key(self) -> str:
-        """Whole path, such as ``reward.harm``."""
+        """The whole path, such as ``reward.harm``."""
         return ".".join(self.path)
 
     def inside(self) -> Override:
-        """Setting without its first key: for ``reward.harm=0.5``, ``harm=0.5``."""
+        """The setting without its first key: ``harm=0.5`` for ``reward.harm=0.5``."""
         return Override(self.text, self.path[1:], self.value)
 
     @staticmethod
     def parse(texts: Sequence[str]) -> list[Override]:
-        """Parse settings ``key.path=value``; a value is YAML on one line, such as ``{uniform: [1, 2]}``.
+        """Settings from texts ``key.path=value``; a value is YAML on one line, such as ``{uniform: [1, 2]}``.
 
         Raises ``InvalidInput`` for a text without ``=``, an empty key, a repeated path, or a value that is not YAML.
         """

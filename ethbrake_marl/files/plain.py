@@ -24,7 +24,7 @@ def read_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> bytes:
-    """Content of a plain file. Arguments and errors as in ``open_plain``."""
+    """Content of a plain file. Arguments and errors are those of ``open_plain``."""
     with open_plain(path, limit_bytes, refusal=refusal, follow_links=follow_links) as stream:
         data = stream.read(limit_bytes + 1)  # files of /proc say that they are empty, and a file may grow
     if len(data) > limit_bytes:
@@ -43,7 +43,7 @@ def open_plain(
     """Open a plain file of at most ``limit_bytes``.
 
     Kind and size are checked first, so pipes and devices are never opened. Raises ``refusal`` with path and reason if
-    the file does not exist, is not plain, is a symbolic link (with ``follow_links=False``), is too large or cannot be
+    the file does not exist, is not plain, is a symbolic link (unless ``follow_links``), is too large or cannot be
     opened.
     """
     file = Path(path)
@@ -72,7 +72,7 @@ def _too_large(file: Path, limit_bytes: int, refusal: type[EthBrakeError]) -> Et
 
 
 def parse_strict_json(data: bytes) -> Any:
-    """Parse UTF-8 JSON. Raises ``ValueError`` with a one-line reason for repeated keys, NaN, infinity or bad text."""
+    """Content of UTF-8 JSON. Raises ``ValueError`` with a reason for repeated keys, NaN, infinity and bad text."""
     try:
         return json.loads(
             data.decode("utf-8"), object_pairs_hook=_object, parse_constant=_not_a_number, parse_float=_finite

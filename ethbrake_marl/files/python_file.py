@@ -23,10 +23,11 @@ _SHA256: dict[Path, str] = {}  # of each Python file, and of the files that they
 
 
 def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
-    """Run a Python file, once per process, and return the object ``name`` that it defines.
+    """Object ``name`` that a Python file defines. The file runs once per process.
 
-    The code has all rights of the user. ``reads``: a file that it uses, such as weights; its SHA-256 is recorded too.
-    Raises ``InvalidInput`` if the Python file is missing, fails, has changed since it ran, or does not define ``name``.
+    The code has all rights of the user. ``reads``: another file that the code uses, such as weights; its SHA-256 is
+    recorded, too. Raises ``InvalidInput`` if the Python file is missing, fails, has changed since it ran, or does not
+    define ``name``.
     """
     module = _run_file(Path(path).expanduser(), f"file {path!r}")
     if not hasattr(module, name):
@@ -40,16 +41,16 @@ def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
 
 
 def files_run() -> dict[str, str]:
-    """File name -> SHA-256 of every Python file that this process ran, and of the files that they use.
+    """SHA-256 of every Python file that this process ran, and of the files that they use: file name -> hash.
 
-    For several files of one name, all their hashes are given, separated by commas.
+    If several files have the same name, their hashes are separated by commas.
     """
     names = dict.fromkeys(path.name for path in _SHA256)
     return {name: ", ".join(sorted({sha for path, sha in _SHA256.items() if path.name == name})) for name in names}
 
 
 def _run_file(path: Path, what: str) -> ModuleType:
-    """Module of a Python file, which runs if it has not run before. ``what`` names it in messages."""
+    """Module of a Python file, which runs unless it has run before. ``what``: name of the file in messages."""
     if not path.is_file():
         raise InvalidInput(f"{what}: {'is not a plain file' if path.exists() else 'does not exist'}")
     content, path = read_plain(path, _LIMIT_BYTES), path.resolve()
@@ -63,6 +64,7 @@ def _run_file(path: Path, what: str) -> ModuleType:
 
 
 def _run(content: bytes, path: Path, sha256: str, what: str) -> None:
+    """Run a Python file as a new module. Raises ``InvalidInput`` if its code fails."""
     module = ModuleType(f"ethbrake_file_{path.stem}_{sha256[:12]}")
     module.__file__ = str(path)
     _RUN[path] = sys.modules[module.__name__] = module

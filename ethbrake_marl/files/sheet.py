@@ -1,4 +1,4 @@
-"""``Sheet``: a table of numbers, intervals and texts for terminal, CSV and JSON."""
+"""``Sheet``: a table of numbers, intervals and texts, for a terminal, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ DASH = "–"  # shown for a missing value
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
+    """An estimated number with its 95 % interval."""
+
     value: float
     interval: tuple[float, float] | None  # low and high end; None if it cannot be computed, as for one world
     # standard error, and its degrees of freedom; None where they are not known
@@ -30,16 +32,16 @@ class Estimate:
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """Value and interval, times ``scale``, as text, such as ``24.19 [23.85, 24.53]``."""
+        """Text of value and interval, both times ``scale``, such as ``24.19 [23.85, 24.53]``."""
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:
-        """``{"value": ..., "interval": [low, high] or None}``."""
+        """Plain data for JSON: ``{"value": ..., "interval": [low, high] or None}``."""
         return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-        """Estimates in flat form for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; None if unknown."""
+        """Estimates as flat data for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; None for unknown ones."""
         cells: dict[str, Any] = {}
         for name, estimate in estimates.items():
             cells[name] = None if estimate is None else estimate.value
@@ -50,7 +52,7 @@ class Estimate:
 
 
 class CellText(NamedTuple):
-    """Text of a cell: the value, and the interval if it has one."""
+    """Text of a table's cell: the value, and the interval if there is one."""
 
     value: str  # the number with its unit, or the text
     interval: str = ""  # ``23.85, 24.53``
@@ -107,7 +109,7 @@ Row = Sequence[Any] | str  # a row of cells, or the name of a section that begin
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A table. Rows may be shorter than the list of columns; the other cells are empty.
+    """A table. A row may be shorter than the list of columns; its missing cells are empty.
 
     >>> from ethbrake_marl.files.sheet import Column, Estimate, Sheet
     >>> sheet = Sheet("Harm", ["Agent", Column("Total", "total_harm")], [("coast", Estimate(1.5, (1.0, 2.0)))])
@@ -139,7 +141,7 @@ class Sheet:
         return [column.name for column in self.formats]
 
     def formatted_rows(self) -> Iterator[str | tuple[CellText, ...]]:
-        """Each row as formatted cells, and each section as its name."""
+        """Rows of the table: a tuple of formatted cells, or the name of a section that begins."""
         columns = self.formats
         for row in self.rows:
             if isinstance(row, str):
@@ -149,23 +151,23 @@ class Sheet:
                 yield (*cells, *[CellText("")] * (len(columns) - len(cells)))
 
     def only(self, columns: Iterable[int]) -> Sheet:
-        """Table with only the given columns (from 0)."""
+        """Table with only these columns (indices from 0)."""
         names = list(columns)
         rows = [row if isinstance(row, str) else [row[k] for k in names if k < len(row)] for row in self.rows]
         return replace(self, columns=[self.columns[k] for k in names], rows=rows)
 
     def filled(self) -> list[int]:
-        """Indices of the columns that have a value in some row; all indices if there are no rows."""
+        """Indices of the columns with a value in some row; all indices if the table has no rows."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
         ]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Table, with the note below, for a terminal.
+        """Table for a terminal, with the note below.
 
-        Names in the first column are never broken: names that do not fit become numbers, which are explained below the
-        table.
+        Names in the first column are never broken: a name that does not fit is replaced by a number, which is explained
+        below the table.
         """
         from rich import box
         from rich.table import Table
@@ -204,7 +206,9 @@ class Sheet:
             yield Text(f"\n{note}", "dim")
 
     def _fitted(self, width: int, rows: Sequence[Sequence[str]]) -> tuple[int, dict[str, str]]:
-        """Number of columns that fit into ``width`` characters, and the number of each name that does not fit."""
+        """Number of columns that fit into ``width`` characters; and a number such as ``[1]`` for each name that does
+        not.
+        """
         columns = self.formats
         texts = [[column.short or column.heading, *(row[k] for row in rows)] for k, column in enumerate(columns)]
         wide = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
@@ -244,7 +248,7 @@ def terminal_text(*parts: RenderableType) -> str:
 
 
 def flat_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Row in which each pair ``x_interval`` becomes two entries, ``x_low`` and ``x_high``."""
+    """Copy of a row in which two entries, ``x_low`` and ``x_high``, replace each pair ``x_interval``."""
     line: dict[str, Any] = {}
     for name, value in row.items():
         if name.endswith("_interval"):
@@ -256,7 +260,9 @@ def flat_row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
-    """``flat_row`` rows as CSV with a header: all columns, in order of appearance. Missing values are empty."""
+    """Rows as CSV text, after ``flat_row``. The header has all columns in order of appearance; missing values are
+    empty.
+    """
     lines = [flat_row(row) for row in rows]
     text = io.StringIO(newline="")
     names = dict.fromkeys(name for line in lines for name in line)

@@ -1,4 +1,4 @@
-"""Atomic writing: files and folders appear completely or not at all, even after a crash. Also lock files."""
+"""Atomic writing: a file or folder appears completely or not at all, even after a crash. Also lock files."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write or replace a file. A reader sees either the old or the new content."""
+    """Write or replace a file. Other processes read either the old or the new content."""
     with new_file(path) as partial:
         partial.write_bytes(data)
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Temporary path, whose file is renamed to ``path`` if the block succeeds, otherwise deleted."""
+    """Path of a temporary file, which is renamed to ``path`` if the block succeeds, otherwise deleted."""
     partial = _temporary(path.parent)
     try:
         yield partial
@@ -41,8 +41,8 @@ def new_file(path: Path) -> Iterator[Path]:
 def check_target(path: str | Path, *, force: bool = False) -> Path:
     """Check, before a long computation, that ``path`` can be written as a file.
 
-    Raises ``AlreadyExists`` if it exists, unless ``force``. Raises ``InvalidInput`` if it cannot be written, or is a
-    folder, device, pipe or symbolic link.
+    Raises ``AlreadyExists`` for an existing file, unless ``force``. Raises ``InvalidInput`` if ``path`` cannot be
+    written, or is a folder, device, pipe or symbolic link.
     """
     target = Path(path)
     try:
@@ -68,10 +68,10 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
 
 
 def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False) -> None:
-    """Check that ``path`` can be used as a folder for results. It is not created.
+    """Check that ``path`` can be used as a folder for results. The folder is not created.
 
-    Raises ``InvalidInput`` if it is not a folder or cannot be written to. Raises ``AlreadyExists`` if it contains one
-    of ``files``, unless ``force``.
+    Raises ``InvalidInput`` if ``path`` is not a folder or cannot be written to. Raises ``AlreadyExists`` if the folder
+    contains one of ``files``, unless ``force``.
     """
     try:
         places = (path, *path.absolute().parents)
@@ -118,14 +118,17 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def remove_folder(path: Path) -> None:
-    """Delete a folder. It is renamed first, so an interruption leaves no half-deleted folder at ``path``."""
+    """Delete a folder. The folder is renamed first, so an interruption leaves no half-deleted folder at ``path``."""
     aside = _temporary(path.parent)
     path.rename(aside)
     shutil.rmtree(aside)
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete temporary files of killed processes in ``folder``. No other process may be writing there."""
+    """Delete the temporary files and folders that killed processes left in ``folder``.
+
+    No other process may be writing to this folder.
+    """
     for leftover in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
         if leftover.is_dir() and not leftover.is_symlink():
             shutil.rmtree(leftover)
@@ -135,9 +138,10 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextmanager
 def hold_lock(lock: Path, message: str) -> Iterator[None]:
-    """Hold a lock file during the block. If the process ends, the lock is released too.
+    """Hold the lock file ``lock`` during the block. The lock is also released if the process ends.
 
-    Raises ``InvalidInput`` if another process holds it (with the message ``message``), or if the file cannot be locked.
+    Raises ``InvalidInput`` with the text ``message`` if another process holds the lock, or if the file cannot be
+    locked.
     """
     held = FileLock(lock, blocking=False, mode=0o666)
     try:

@@ -1,4 +1,4 @@
-"""A strict reader of YAML files that records the line number of every value."""
+"""A strict reader of YAML files, which records the line number of every value."""
 
 from __future__ import annotations
 
@@ -32,16 +32,17 @@ _RESERVED = {"null", "true", "false"}
 
 
 def flow_text(value: Any, longest: int | None = None) -> str:
-    """``value`` as YAML on one line (flow style), which reads back as an equal value.
+    """``value`` as YAML on one line (flow style). Parsing this text gives an equal value.
 
-    ``value`` may consist of printable texts, lists, mappings with text keys, numbers, true, false and null. ``longest``
-    cuts the text off, for error messages.
+    ``value`` may consist of printable texts, lists, mappings with text keys, numbers, true, false and null.
+    ``longest``: largest length of the text, which is cut off for error messages; None: no limit.
     """
     text = _flow(value)
     return text if longest is None or len(text) <= longest else f"{text[: longest - 3]}..."
 
 
 def _flow(value: Any) -> str:
+    """Text of ``flow_text``; values of other types become their ``repr``."""
     if isinstance(value, BaseModel):
         value = value.model_dump(exclude_none=True)
     if isinstance(value, dict):
@@ -94,7 +95,9 @@ class Document:
     lines: Mapping[YamlPath, int]  # line number (from 1) of each value
 
     def where(self, path: YamlPath) -> str:
-        """File and line of a value, such as ``my.yaml, line 7``. A missing value has the line of its mapping."""
+        """File and line of the value at ``path``, such as ``my.yaml, line 7``; for a missing value, the line of its
+        mapping.
+        """
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
                 return f"{self.file}, line {self.lines[path[:length]]}"
@@ -102,7 +105,7 @@ class Document:
 
     @contextmanager
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
-        """Put ``where(path)`` in front of the message of an ``InvalidInput`` that the block raises."""
+        """Put the place ``where(path)`` in front of the message of an ``InvalidInput`` that the block raises."""
         try:
             yield
         except InvalidInput as error:
@@ -110,12 +113,15 @@ class Document:
 
 
 def read_yaml(path: str | Path, limit: int = YAML_SIZE_LIMIT) -> Document:
-    """Read a YAML file of at most ``limit`` bytes. Raises ``InvalidInput`` with file, line, column and reason."""
+    """Content of a YAML file of at most ``limit`` bytes.
+
+    Raises ``InvalidInput`` with file, line, column and reason.
+    """
     return parse_yaml(read_plain(path, limit), str(Path(path)), limit)
 
 
 def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = YAML_SIZE_LIMIT) -> Document:
-    """Parse one YAML document of at most ``limit`` bytes; ``file`` names it in messages.
+    """Content of a YAML document of at most ``limit`` bytes. ``file``: name of the document in messages.
 
     Raises ``InvalidInput`` with file, line, column and reason.
     """
@@ -133,7 +139,7 @@ def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = YAML_SIZE_L
 
 @lru_cache(maxsize=128)
 def _parse(text: str, file: str) -> tuple[Any, Mapping[YamlPath, int]]:
-    """Content and lines, which are kept for the next reader of the same text (10 ms) and must not be changed."""
+    """Content of a YAML text, and the line of each value. Both are cached (10 ms) and must not be changed."""
     lines: dict[YamlPath, int] = {}
     try:
         node = yaml.compose(text, Loader=_Loader)
@@ -153,7 +159,7 @@ def _parse(text: str, file: str) -> tuple[Any, Mapping[YamlPath, int]]:
 
 
 class _Refused(yaml.MarkedYAMLError):
-    """Valid YAML that this reader refuses."""
+    """The error for valid YAML that this reader refuses."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -163,6 +169,7 @@ class _Loader(yaml.SafeLoader):
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
+        """The next node. Raises ``_Refused`` for an alias, an anchor, a tag or too deep nesting."""
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         problem = ""
         if isinstance(event, yaml.AliasEvent):
@@ -182,7 +189,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
-    """Return the value of a node; add the line numbers of all values in it to ``lines``."""
+    """Value of a node. The line numbers of all values in the node are added to ``lines``."""
     lines.setdefault(path, node.start_mark.line + 1)
     if isinstance(node, yaml.ScalarNode):
         return _scalar(node)
@@ -203,7 +210,7 @@ def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
 
 
 def _scalar(node: yaml.ScalarNode) -> Any:
-    """Value of a scalar. Quoted and block scalars are always text."""
+    """Value of a scalar. A quoted or block scalar is always text."""
     if node.style is not None:
         return str(node.value)
     value = next(

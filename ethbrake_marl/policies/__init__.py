@@ -1,1 +1,1 @@
-"""Policies, stored as JSON and safetensors files (never a pickle) and run without torch."""
+"""Policies: stored as JSON and safetensors files (never a pickle), and run without torch."""

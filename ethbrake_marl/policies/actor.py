@@ -10,13 +10,13 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.layers import Float32s, dense, layers_of, squash
 from ethbrake_marl.policies.network import NetworkSpec
 
-BLOCK_ROWS = 256  # observations computed together: what lies between the layers fits the cache, with the same bits
+BLOCK_ROWS = 256  # observations computed together: outputs of a layer then fit the cache; the bits are the same
 
 
 class Actor:
-    """The deterministic actions of a policy; each observation is computed independently of the others.
+    """Computes the deterministic actions of a policy, each observation independently of the others.
 
-    ``tensors`` must fit ``spec.tensors``.
+    ``tensors``: weights and biases, with the names and shapes of ``spec.tensors``.
     """
 
     def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s]) -> None:
@@ -24,7 +24,10 @@ class Actor:
         self.layers = layers_of(tensors, "policy", len(spec.policy_hidden))
 
     def __call__(self, observations: Float32s) -> Float32s:
-        """Actions [n, 1] in [-1, 1] for observations [n, F] float32. Raises ``InvalidInput``."""
+        """Actions [n, 1] in [-1, 1] for observations [n, F] float32.
+
+        Raises ``InvalidInput`` for a wrong shape or type, and for observations that are not finite.
+        """
         check_observations(observations, self.spec.observation_size)
         actions = np.empty((len(observations), 1), np.float32)
         for start in range(0, len(observations), BLOCK_ROWS):
@@ -33,7 +36,7 @@ class Actor:
         return actions
 
     def columns(self, x: Float32s) -> Float32s:
-        """Actions [1, rows] for observations as columns, [F, rows]."""
+        """Actions [1, rows] for observations that are stored as columns, [F, rows]."""
         y = self.forward(x)
         if self.spec.output == "choice":
             return self.actions[np.newaxis, y.argmax(axis=0)]
@@ -43,6 +46,7 @@ class Actor:
         return y
 
     def forward(self, x: Float32s) -> Float32s:
+        """Outputs of the last layer, [outputs, rows], for observations as columns, [F, rows]."""
         for number, (weight, bias) in enumerate(self.layers, 1):
             y = np.empty((len(weight), x.shape[1]), np.float32)
             dense(weight, bias, x, y)
@@ -57,7 +61,7 @@ class Actor:
 
 
 def check_observations(observations: Float32s, size: int) -> None:
-    """Raise ``InvalidInput`` unless observations are finite float32 numbers, [n, size]."""
+    """Raise ``InvalidInput`` unless observations have the shape [n, ``size``] and are finite float32 numbers."""
     if observations.ndim != 2 or observations.shape[1] != size or observations.dtype != np.float32:
         raise InvalidInput(
             f"observation: has type {observations.dtype} and shape {observations.shape}; needs type float32 and shape"

@@ -1,4 +1,4 @@
-"""Read policies from folders: a bundle, a shipped policy, the policies of several learners."""
+"""Read and write policies in folders: a bundle, a shipped policy, the policies of several learners."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.policies.manifest import Manifest, content_sha256
 from ethbrake_marl.policies.policy import MANIFEST, WEIGHTS, Policy, checked_tensors
 
-LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}  # of the files of a bundle
+LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}  # largest sizes of the files of a bundle
 POLICY_FOLDER = Path(__file__).resolve().parents[1] / "_policies"  # NAME/policy is a bundle, NAME/card.md describes it
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
-    """Policy in a bundle, or in the folder ``policy`` of a training run.
+    """Policy in the folder ``path``: a bundle, or a training run whose folder ``policy`` is one.
 
-    Raises ``InvalidInput`` if there is none, and ``CorruptBundle`` with file and reason if it is damaged.
+    Raises ``InvalidInput`` if there is no policy, and ``CorruptBundle`` with file and reason if it is damaged.
     """
     if not isinstance(path, str | os.PathLike):
         raise InvalidInput(f"policy = {path!r:.60}: must be the path of a training run or of a policy bundle")
@@ -45,6 +45,7 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
 
 def _read_manifest(file: Path) -> Manifest:
+    """Manifest in a file. Raises ``CorruptBundle`` if its content is damaged, edited or does not fit this package."""
     try:
         content, manifest = read_json_model(_read(file), Manifest)
     except ValueError as error:
@@ -64,6 +65,7 @@ def _read(file: Path) -> bytes:
 
 
 def _bundle_in(path: Path) -> Path:
+    """Folder of the bundle at ``path`` or ``path/policy``. Raises ``InvalidInput`` if there is none or several."""
     folders = [folder for folder in (path, path / "policy") if os.path.isdir(folder)]  # no errors
     for folder in folders:
         if LIMITS_BYTES.keys() & set(os.listdir(folder)):
@@ -77,12 +79,12 @@ def _bundle_in(path: Path) -> Path:
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Name -> folder of every shipped policy. The folder has its card and the bundle ``policy``."""
+    """Shipped policies, name -> folder. A folder has ``card.md`` and the bundle ``policy``."""
     return {folder.parent.name: folder.parent for folder in sorted(POLICY_FOLDER.glob("*/policy"))}
 
 
 def load_shipped(name: str) -> Policy:
-    """Shipped policy, such as ``universal``. Raises ``UnknownName``."""
+    """Shipped policy with this name, such as ``universal``. Raises ``UnknownName``."""
     folders = shipped_policies()
     if name not in folders:
         raise unknown_name("shipped policy", name, folders)
@@ -90,14 +92,15 @@ def load_shipped(name: str) -> Policy:
 
 
 def load_named_policy(name: str) -> Policy:
-    """Shipped policy by its name, or another policy by the path of its run or bundle, such as ``./ppo``."""
+    """Policy with the name of a shipped policy, or with the path of a run or bundle, such as ``./ppo``."""
     return load_policy(shipped_policies().get(name, name))
 
 
 def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], *, replace: bool = False) -> None:
-    """Write the learners' policies, vehicle -> policy: as one bundle if they share it, else as a folder of bundles.
+    """Write the policies of learners, vehicle -> policy: one bundle if all share a policy, else one folder per vehicle.
 
-    Raises ``AlreadyExists``; with ``replace`` an existing folder is deleted once the new one is complete.
+    Raises ``AlreadyExists`` for an existing folder; with ``replace`` that folder is deleted once the new one is
+    complete.
     """
     first = next(iter(drivers.values()))
     if all(policy is first for policy in drivers.values()) and tuple(drivers) == first.manifest.learners:
@@ -109,7 +112,10 @@ def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], 
 
 
 def load_drivers(folder: str | os.PathLike[str]) -> dict[str, Policy]:
-    """Vehicle -> policy, front to rear, of a ``save_drivers`` folder. Raises the errors of ``load_policy``."""
+    """Policies in a folder that ``save_drivers`` wrote, vehicle -> policy, front to rear.
+
+    Raises the errors of ``load_policy``.
+    """
     path = Path(folder)
     names = sorted((place.name for place in path.glob("vehicle_[1-9]*")), key=lambda name: (len(name), name))
     if names:

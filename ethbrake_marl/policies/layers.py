@@ -22,9 +22,9 @@ CUBIC_BELOW = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
 
 
 def layers_of(tensors: Mapping[str, Float32s], name: str, hidden: int) -> Layers:
-    """(weight, bias) of each layer, from the tensors ``name.0.weight`` to ``name.output.bias``.
+    """Weight and bias of each layer, from the tensors ``name.0.weight`` to ``name.output.bias``.
 
-    ``hidden`` is the number of hidden layers.
+    ``hidden``: number of hidden layers.
     """
     names = [f"{name}.{k}" for k in range(hidden)] + [f"{name}.output"]
     return [

@@ -31,7 +31,7 @@ version_of = cache(version)  # reading one takes a millisecond
 
 
 def installed_versions() -> dict[str, str]:
-    """Name -> version of Python, the physics, and every package that may affect a training."""
+    """Versions of Python, the physics, and every package that may affect a training, name -> version."""
     core_versions = {"python": platform.python_version(), PHYSICS_KEY: physics_digest()}
     return core_versions | {name: version_of(name) for name in POLICY_PACKAGES} | versions_used()
 
@@ -45,9 +45,9 @@ class Manifest(FiniteModel):
     network: NetworkSpec
     observation: ObservationSchema
     action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"  # -1 is full braking
-    learners: Annotated[tuple[Learner, ...], Field(min_length=1)]  # vehicles that it has learned to control
+    learners: Annotated[tuple[Learner, ...], Field(min_length=1)]  # vehicles that the policy has learned to control
     scenario: dict[str, JsonValue]  # all values of the scenario of the training
-    reward: dict[str, JsonValue]  # all settings of its reward
+    reward: dict[str, JsonValue]  # all settings of the training's reward
     seeds: dict[str, int]  # purpose -> seed
     steps: Annotated[int, Field(ge=0)]  # decisions of the learners in training
     versions: dict[str, str]  # at the time of training
@@ -56,7 +56,7 @@ class Manifest(FiniteModel):
 
     @property
     def time_step_s(self) -> float:
-        """Time between two decisions in training (s); NaN if the file does not contain it."""
+        """Time between two decisions in training (s); NaN if the manifest does not contain it."""
         step = self.scenario.get("time_step_s")
         is_valid = isinstance(step, int | float) and not isinstance(step, bool) and 0.0 < step <= LONGEST_STEP_S
         return float(step) if is_valid else math.nan  # type: ignore[arg-type]  # a number
@@ -79,9 +79,9 @@ class Manifest(FiniteModel):
 
 
 def content_sha256(content: Mapping[str, Any]) -> str:
-    """SHA-256 of a manifest without its key ``manifest_sha256``, as sorted ASCII JSON without spaces.
+    """SHA-256 of a manifest without its key ``manifest_sha256``, written as sorted ASCII JSON without spaces.
 
-    It reveals damage and edits, but is not a signature.
+    The hash reveals damage and edits, but is not a signature.
     """
     hashed = {key: value for key, value in content.items() if key != "manifest_sha256"}
     return hashlib.sha256(json.dumps(hashed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

@@ -24,7 +24,7 @@ class NetworkSpec(FileModel):
     - ``clip``: the output, clipped. In training (PPO) it is the mean of a Gaussian with one noise parameter per action.
     - ``tanh``: the tanh of the output. In training (SAC) a second head of the actor gives the noise.
     - ``choice``: the outputs are scores of ``choices`` actions, evenly spaced from -1 to 1. The action with the highest
-      score is taken, the lowest one in a tie. No noise, no critic.
+      score is taken; in a tie, the lowest action. There is no noise and no critic.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]  # F
@@ -49,7 +49,7 @@ class NetworkSpec(FileModel):
 
     @property
     def actions(self) -> Float32s:
-        """Actions whose scores are the outputs under ``choice``, [choices]."""
+        """Actions that the outputs score, if ``output`` is ``choice``, [choices]."""
         return np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
 
     @property
@@ -59,7 +59,7 @@ class NetworkSpec(FileModel):
 
     @property
     def tensors(self) -> Shapes:
-        """Name -> shape of every float32 tensor; a weight is [outputs, inputs], as in ``y = W x + b``."""
+        """Shapes of all float32 tensors, name -> shape; a weight is [outputs, inputs], as in ``y = W x + b``."""
         shapes = self._network("policy", self.policy_hidden, self.choices or 1)
         if self.output == "clip":
             shapes["policy.log_std"] = (1,)

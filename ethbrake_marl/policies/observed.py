@@ -1,4 +1,4 @@
-"""The features that a policy observes, as its file describes them, and a check that they are still the same here."""
+"""The features that a policy observes, as its file describes them, and a check that they have not changed since."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class FiniteModel(FileModel):
 
 
 class FeatureDefinition(FiniteModel):
-    """A feature with a function of its own, as it was when the policy was trained."""
+    """A feature that is computed by a registered function, as it was when the policy was trained."""
 
     name: Annotated[str, Field(max_length=64)]
     of: Of
@@ -85,10 +85,10 @@ class ObservationSchema(FiniteModel):
         )  # fmt: skip
 
     def check(self, where: Path, version: str) -> None:
-        """Raise an error unless every feature is the same as in training, with ``version`` of this package.
+        """Raise an error unless every feature is the same as in training. ``version``: of this package in training.
 
-        ``InvalidInput``: a user's feature is missing or has changed. ``CorruptBundle``: a feature of this package
-        differs.
+        ``InvalidInput``: a user's feature is missing or has changed. ``CorruptBundle``: a feature of this package has
+        changed.
         """
         for old in self.registered:
             observes = f"{where}: the policy observes the feature {old.name!r:.80}"
@@ -125,7 +125,7 @@ def _is_ours(entry: ComputedFeature) -> bool:
 
 
 def _trial_values(entry: ComputedFeature) -> tuple[float, ...]:
-    """A feature's values in the trial worlds: in one world if this package defines it, else in three."""
+    """Values of a feature in some trial worlds: in one world if this package defines the feature, else in three."""
     state = _trial_worlds()
     if _is_ours(entry):
         state = state.take(slice(1))

@@ -61,14 +61,14 @@ class Policy:
         return View(self.manifest.observation.features)
 
     def __call__(self, observations: Float32s) -> Float32s:
-        """Actions [n, 1] in [-1, 1] for observations [n, F] float32. A row does not depend on the others."""
+        """Actions [n, 1] in [-1, 1] for observations [n, F] float32. Row k depends on observation k only."""
         return self.actor(observations)
 
     @classmethod
     def make(cls, tensors: Mapping[str, Float32s], *, network: NetworkSpec, observation: View, **manifest: Any) -> Self:
         """Policy with these tensors. ``manifest``: all fields of ``Manifest`` except hashes and versions.
 
-        Raises ``InvalidInput`` with the bad tensor or field.
+        Raises ``InvalidInput`` that names the invalid tensor or field.
         """
         data = serialised(tensors)
         try:
@@ -83,9 +83,10 @@ class Policy:
             raise InvalidInput(f"policy: {reason}") from None
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
-        """Write the bundle as a new folder, completely or not at all. Raises ``AlreadyExists``.
+        """Write the bundle as a new folder, completely or not at all.
 
-        With ``replace`` an existing folder is deleted once the new one is complete.
+        Raises ``AlreadyExists`` for an existing folder; with ``replace`` that folder is deleted once the new one is
+        complete.
         """
         manifest = self.manifest.model_copy(update={"manifest_sha256": _own_sha256(self.manifest)})
         with new_folder(Path(folder).expanduser(), replace=replace) as partial:
@@ -102,9 +103,9 @@ def serialised(tensors: Mapping[str, Float32s]) -> bytes:
 
 
 def checked_tensors(data: bytes, network: NetworkSpec) -> dict[str, Float32s]:
-    """Name -> read-only tensor, from the bytes of a safetensors file.
+    """Read-only tensors in the content of a safetensors file, name -> tensor.
 
-    Raises ``ValueError`` for a tensor of a wrong name, shape or type, or with an entry that is not finite.
+    Raises ``ValueError`` for a tensor with a wrong name, shape or type, or with an entry that is not finite.
     """
     try:
         tensors = safetensors.numpy.load(data)

@@ -21,12 +21,12 @@ ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Ta
 class Algorithm(ABC):
     """Base class of learning algorithms. A subclass needs only ``build`` if its networks are like PPO's or SAC's.
 
-    Checkpoints save the parts of the model that its method ``_get_torch_save_params`` names.
+    Checkpoints save the parts that the model's method ``_get_torch_save_params`` names.
     """
 
     @abstractmethod
     def build(self, training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
-        """New model on the CPU, with random numbers from the recipe's seed only.
+        """New model on the CPU. Its random numbers come from the recipe's seed alone.
 
         ``environment`` has one row for each learner in each world.
         """
@@ -49,7 +49,7 @@ class Algorithm(ABC):
 
 
 def tensors_of(name: str, layers: Iterable[nn.Module]) -> dict[str, Float32s]:
-    """Weights of linear layers: ``name.0.weight``, ... ``name.output.bias``."""
+    """Weights and biases of the linear layers: ``name.0.weight``, ``name.0.bias``, ... ``name.output.bias``."""
     *hidden, output = (layer for layer in layers if isinstance(layer, nn.Linear))
     tensors: dict[str, Float32s] = {}
     for k, layer in enumerate(hidden):

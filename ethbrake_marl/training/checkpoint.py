@@ -56,7 +56,10 @@ def capture(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
-    """Put ``saved`` into a new model that has a logger. Raises errors of Python, NumPy or torch if it does not fit."""
+    """Put the state ``saved``, which ``capture`` returned, into a new model that has a logger.
+
+    Raises errors of Python, NumPy or torch if the state does not fit the model.
+    """
     environment: Any = model.env
     model._last_obs, model._last_episode_starts = environment.reset(), np.ones(environment.num_envs, np.bool_)
     new = capture(model)
@@ -89,7 +92,7 @@ def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
 def restore_types(new: Any, saved: Any) -> Any:
     """Saved data with the types of ``new``: arrays instead of tensors, named tuples instead of plain ones.
 
-    Raises ``ValueError`` if entries, or shape or type of an array, differ.
+    Raises ``ValueError`` if keys or lengths differ, or the shape or type of an array.
     """
     if isinstance(new, np.ndarray):
         array = saved.numpy().copy()
@@ -107,6 +110,7 @@ def restore_types(new: Any, saved: Any) -> Any:
 
 
 def to_tensors(tree: Any) -> Any:
+    """Nested data with tensors instead of NumPy arrays, and plain tuples instead of named ones."""
     if isinstance(tree, np.ndarray):
         return torch.from_numpy(tree.copy())  # policies' tensors are read-only
     if isinstance(tree, dict):
@@ -147,7 +151,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def newest_checkpoint(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
-    """Return the newest undamaged checkpoint, or None, and the errors of newer ones, which are deleted."""
+    """Newest undamaged checkpoint, or None; and the errors of newer ones, which are deleted."""
     reasons: list[str] = []
     for path in files_in(folder):
         try:

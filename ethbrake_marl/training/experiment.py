@@ -55,7 +55,10 @@ class ReportWriter(Protocol):
     measures: tuple[str, ...]  # names of the measures that it can show; those that no package has are left out
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
-        """Write the report; return the tables to print, and a text that says where it is. ``tell`` reports progress."""
+        """Write the report; return the tables to print, and a text that says where the report is.
+
+        ``tell`` is called with the progress.
+        """
 
 
 class Tables:
@@ -125,9 +128,9 @@ def run_experiment(
 
 
 def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: OnProgress) -> list[str]:
-    """Return the names for which ``use`` works, and report to ``tell`` why others fail; ``what`` is the kind of names.
+    """Names for which ``use`` raises no ``InvalidInput``. ``tell`` is called with the error of every other name.
 
-    Raises the error if full braking fails.
+    ``what``: what the names stand for, in words. An error of full braking is raised.
     """
     usable_names = []
     for number, name in enumerate(names):
@@ -144,9 +147,9 @@ def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: 
 def compared_teams(
     trained: TrainResult, scenario: Scenario, harm_count: str, baselines: Sequence[str]
 ) -> Mapping[str, Team]:
-    """Teams to compare: baselines, then the trained policies, without and with a shield.
+    """Teams to compare: the baselines, then the trained policies without and with a shield.
 
-    With several learners there is also a team for each learner in which this learner brakes fully.
+    With several learners, there is one more team for each learner, in which this learner brakes fully.
     """
     agents: dict[str, Any] = {name: name for name in baselines}
     if len(trained.policies) == 1:

@@ -25,7 +25,7 @@ OBJECTIVE_METRIC = "objective"  # mean of what the learners minimise, where that
 
 
 def measure_on_list(training: Training) -> Evaluate:
-    """Function that measures policies on the recipe's fixed list of worlds (key ``evaluation``).
+    """Function that measures policies (learner -> policy) on the recipe's fixed list of worlds (key ``evaluation``).
 
     Metrics are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost`` (for exact impacts),
     ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a learner's objective is not the
@@ -44,6 +44,7 @@ def measure_on_list(training: Training) -> Evaluate:
 
 
 def metrics_of(training: Training, last: State) -> dict[str, float]:
+    """Metrics of ``measure_on_list``, from the last states of the episodes. The count that is minimised comes first."""
     reward, scenario = training.recipe.reward, training.scenario
     counts = sorted(COLUMN, key=lambda count: count != reward.harm_count)  # what is counted comes first
     harm_counts = [count for count in counts if count != "honest" or last.is_exact]
@@ -64,5 +65,5 @@ def exact_mean(values: Floats) -> float:
 
 
 def deciding(metrics: Mapping[str, float], harm_count: str) -> float:
-    """Value by which a training picks its best policy, less is better; NaN if it was not measured."""
+    """The metric by which a training picks its best policy, the one with the lowest value; NaN if not measured."""
     return metrics.get(OBJECTIVE_METRIC, metrics.get(COLUMN[harm_count], np.nan))

@@ -1,4 +1,4 @@
-"""One training of many, for sweeps and studies: it is started, resumed or read, as needed."""
+"""One of many trainings, for sweeps and studies: it is started, resumed, or read if it has finished."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ MEASURED = (*COLUMN.values(), "collision_rate")
 
 @contextmanager
 def folder_of_many(folder: Path, *results: str) -> Iterator[None]:
-    """Create and lock a folder for many trainings. Its files ``results`` may be replaced.
+    """Create a folder for many trainings, and lock it during the block.
 
-    Raises ``InvalidInput`` if another process uses it, or if it cannot be written to.
+    Existing files with the names ``results`` may be replaced. Raises ``InvalidInput`` if another process uses the
+    folder, or if it cannot be written to.
     """
     check_folder(folder, results, force=True)
     folder.mkdir(parents=True, exist_ok=True)
@@ -34,14 +35,14 @@ def folder_of_many(folder: Path, *results: str) -> Iterator[None]:
 
 
 class Job(NamedTuple):
-    """One training of many. It can be pickled."""
+    """One of many trainings, and the folder of its run. It can be pickled."""
 
     training: Training
-    folder: Path  # of its run, which need not exist
-    settings: tuple[str, ...] = ()  # ``KEY=VALUE``, by which it differs from files, for ``config.json``
+    folder: Path  # of the run; need not exist
+    settings: tuple[str, ...] = ()  # ``KEY=VALUE``: changes of recipe and scenario files, for ``config.json``
 
     def finish(self, on_progress: OnProgress | None = None) -> bool:
-        """Do the rest of the training; return False if Ctrl-C stopped it.
+        """Start or resume the training, unless it has finished; return False if Ctrl-C stopped it.
 
         Raises the errors of ``train``, and ``InvalidInput`` if the folder contains another training.
         """
@@ -58,7 +59,9 @@ class Job(NamedTuple):
         return resume(self.folder, on_progress=on_progress).status == "finished"
 
     def attempt(self) -> str:
-        """Do the rest of the training; return the error message, or ""."""
+        """Call ``finish``; return the message of its error, empty if there is none. Ctrl-C raises
+        ``KeyboardInterrupt``.
+        """
         try:
             if not self.finish():
                 raise KeyboardInterrupt
@@ -67,7 +70,7 @@ class Job(NamedTuple):
         return ""
 
     def result(self) -> dict[str, float]:
-        """Best measurement of a finished training: ``steps``, ``harm`` (the minimised count), and others."""
+        """Best evaluation of a finished training: ``steps``, ``harm`` (what was minimised), metrics ``MEASURED``."""
         count = self.training.recipe.reward.harm_count
         evaluations = read_object(RunFolder(self.folder).status)["evaluations"]
         best = min(evaluations, key=lambda evaluation: deciding(evaluation, count))

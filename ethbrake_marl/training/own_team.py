@@ -38,7 +38,7 @@ def save_team(
         seed: seed of the training.
         steps: number of decisions of the training.
 
-    Raises ``InvalidInput`` for other learners or other kinds of actors, and ``AlreadyExists``.
+    Raises ``InvalidInput`` if a learner lacks an actor, or for another vehicle or kind of actor; ``AlreadyExists``.
 
     """
     scenario, game = env.unwrapped.scenario, env.unwrapped.game
@@ -67,6 +67,7 @@ def save_team(
 
 
 def network_of(name: str, actor: Any) -> NetworkSpec:
+    """Network of a user's actor, for its policy file. ``name``: learner. Raises ``InvalidInput`` for a wrong actor."""
     mean, log_std = getattr(actor, "mean", None), getattr(actor, "log_std", None)
     layers: list[Any] = list(mean) if isinstance(mean, nn.Sequential) else []
     linear, between = layers[::2], layers[1::2]

@@ -45,7 +45,7 @@ class LearningRate(FileModel):
     )
 
     def at(self, remaining: float) -> float:
-        """``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
+        """Learning rate ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
 
         ``remaining`` is the fraction (1 to 0) of the training's steps that remains.
         """
@@ -78,7 +78,7 @@ class EvaluationPlan(FileModel):
 
 
 class TrainingRecipe(FileModel):
-    """Settings that all algorithms share; each algorithm has a subclass with more.
+    """The settings that all learning algorithms have; each algorithm has a subclass with further settings.
 
     An *update* collects decisions and learns from them. The text in ``Field(description=...)`` explains a key in new
     recipe files, in the JSON Schema and in the documentation.
@@ -157,7 +157,10 @@ class TrainingRecipe(FileModel):
         return 1
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Networks of a policy. Override this unless the actor has one action, clipped to [-1, 1]."""
+        """Networks of a policy with this number of observed features.
+
+        An algorithm overrides this unless its actor has one action, clipped to [-1, 1].
+        """
         shape = vars(self)["network"]
         return NetworkSpec(
             observation_size=observation_size,
@@ -290,6 +293,7 @@ def _algorithm_in(document: Document) -> object:
 
 
 def _check_recipe(document: Document, shipped: Path | None = None) -> TrainingRecipe:
+    """Recipe in a file's content. ``shipped``: its path if it is a shipped recipe, for the error message."""
     name = _algorithm_in(document)
     if not isinstance(name, str) or name not in ALGORITHMS:
         right = f"must be one of {', '.join(ALGORITHMS)}"
@@ -357,7 +361,7 @@ VARIANTS: Registry[type[Any]] = Registry(
 
 
 def algorithm_of(recipe: TrainingRecipe) -> Any:
-    """New ``Algorithm`` for a recipe. Raises ``InvalidInput`` if it cannot use the recipe's device."""
+    """New ``Algorithm`` for a recipe. Raises ``InvalidInput`` if the algorithm cannot use the recipe's device."""
     if recipe.device == "cpu":
         algorithm = ALGORITHMS[recipe.algorithm][1]
         return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()

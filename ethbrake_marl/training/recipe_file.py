@@ -46,7 +46,7 @@ def recipe_schema() -> dict[str, Any]:
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Key -> meaning; a key without a description takes it from the base class."""
+    """Meanings of a recipe's keys, key -> text. A key without a description takes the base class's."""
     meanings: dict[str, str] = {}
     for base in reversed(recipe.__mro__):
         for key, field in base.model_fields.items() if issubclass(base, TrainingRecipe) else ():

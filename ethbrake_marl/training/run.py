@@ -25,7 +25,7 @@ RUN_FORMAT = "ethbrake-run"
 
 
 class RunFolder:
-    """The files of a run. The folder need not exist yet."""
+    """Paths of the files of a training run, and access to them. The folder need not exist yet."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).expanduser()
@@ -38,9 +38,10 @@ class RunFolder:
         self.checkpoints = self.path / "checkpoints"  # until the training has finished
 
     def create(self, config: Mapping[str, Any], *, force: bool = False) -> None:
-        """Create the folder. With ``force`` it replaces an earlier run.
+        """Create the folder with ``config.json`` and ``run.json``. With ``force`` it replaces an earlier run.
 
-        Raises ``AlreadyExists`` for any other existing path, ``InvalidInput`` if a process is training in that run.
+        Raises ``AlreadyExists`` if anything else is at this path, and ``InvalidInput`` if a process is training in the
+        earlier run.
         """
         exists = os.path.lexists(self.path)
         if exists and (self.path.is_symlink() or not self.status.is_file()):
@@ -67,9 +68,10 @@ class RunFolder:
 
     @contextmanager
     def stage(self, name: str, status: Status) -> Iterator[None]:
-        """Record a stage after the training in ``run.json``: its name, how it ended, and the files that it wrote.
+        """Record the block in ``run.json`` as a stage after the training: its name, how it ended, and the files it
+        wrote.
 
-        ``status`` is recorded if the stage succeeds.
+        ``status`` is recorded if the block succeeds.
         """
         with self.held():
             self.write_status("running", stage=name)
@@ -87,9 +89,9 @@ class RunFolder:
                 self.write_status(ended, reason=reason, written=written)
 
     def training(self) -> Training:
-        """Training that is recorded here.
+        """The training that this folder records.
 
-        Raises ``InvalidInput`` if this is not a run, if a file is damaged, or if a folder is a link.
+        Raises ``InvalidInput`` if this is not the folder of a run, if a file is damaged, or if a folder is a link.
         """
         if not (os.path.lexists(self.status) or os.path.lexists(self.config)):
             raise InvalidInput(
@@ -111,7 +113,7 @@ class RunFolder:
             raise InvalidInput(f"{self.config}: {error}") from None
 
     def clear(self) -> None:
-        """Delete unfinished files of killed processes, and the results so far."""
+        """Delete unfinished files of killed processes, and the files that the last ``stage`` wrote."""
         for folder in (self.path, self.checkpoints):
             remove_unfinished(folder)
         written = read_object(self.status).get("written", ())
@@ -120,9 +122,10 @@ class RunFolder:
                 path.unlink()
 
     def open_logs(self, progress: str, steps: int | None) -> list[KVWriter]:
-        """Writers of ``progress.csv``, which starts with the text ``progress``, and of TensorBoard's events.
+        """Writers of ``progress.csv``, which begins with the text ``progress``, and of TensorBoard's events.
 
-        ``steps``: number of steps so far, if a training is resumed; None: delete old events.
+        ``steps``: number of decisions so far of a training that is resumed; None for a new one, which deletes old
+        events.
         """
         self.progress.unlink(missing_ok=True)  # it may be a link, whose target must not be overwritten
         if steps is None:

@@ -34,7 +34,7 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _OwnPartForTheActor(MlpExtractor):
-    """Hidden layers of an actor that sees the first ``own`` of ``whole`` entries, and of a critic that sees all."""
+    """Hidden layers of an actor, for the first ``actor_size`` entries of an observation, and of a critic, for all."""
 
     def __init__(self, actor_size: int, critic_size: int, net_arch: Any, activation_fn: Any) -> None:
         super().__init__(actor_size, net_arch, activation_fn, device="cpu")
@@ -46,9 +46,9 @@ class _OwnPartForTheActor(MlpExtractor):
 
 
 class SeparatePolicies(BasePolicy):
-    """Policies with an optimiser each, one per learner, behind the interface of a single policy.
+    """One policy with one optimiser for each learner, behind the interface of a single policy.
 
-    ``columns`` lists the columns of an observation that each learner sees. ``network``: further arguments of
+    ``columns``: for each learner, the columns of an observation that it sees. ``network``: further arguments of
     Stable-Baselines3's ``ActorCriticPolicy``.
     """
 
@@ -110,7 +110,7 @@ class SeparatePolicies(BasePolicy):
 
 
 class IndependentPPO(PPO):
-    """PPO with a separate policy for each learner. Columns of its log are called ``vehicle_2/loss`` and so on."""
+    """PPO with a separate policy for each learner. Its log has columns such as ``vehicle_2/loss``."""
 
     policy: SeparatePolicies  # type: ignore[assignment]  # has the parts of an actor-critic policy that PPO uses
 
@@ -122,6 +122,7 @@ class IndependentPPO(PPO):
         super().__init__(SeparatePolicies, environment, policy_kwargs=network, **settings)  # type: ignore[arg-type]
 
     def train(self) -> None:
+        """Train each learner's policy by ``PPO.train``, on this learner's part of the rollout buffer."""
         joint, buffer, log, updates = self.policy, self.rollout_buffer, self._logger, self._n_updates
         parts = [self._part(buffer, number) for number in range(len(self.names))]
         try:

@@ -66,18 +66,18 @@ class TrainResult:
 
     @property
     def metrics(self) -> Mapping[str, float] | None:
-        """Evaluation of ``policies``; None if nothing was measured."""
+        """Metrics of ``policies`` on the fixed list; None if nothing was measured."""
         steps = next(iter(self.policies.values())).manifest.steps
         return next((evaluation for evaluation in self.evaluations if evaluation["steps"] == steps), None)
 
     @property
     def policy(self) -> Policy:
-        """The policy that drives all learners. Raises ``InvalidInput`` if each has its own."""
+        """The policy of all learners. Raises ``InvalidInput`` if they have different ones."""
         return _shared_policy(self.policies)
 
     @property
     def last_policy(self) -> Policy:
-        """The policy at the end. Raises ``InvalidInput`` if each learner has its own."""
+        """The policy of all learners at the end. Raises ``InvalidInput`` if they have different ones."""
         return _shared_policy(self.last_policies)
 
 
@@ -97,22 +97,22 @@ def train(
 ) -> TrainResult:
     """Train the learners of a scenario, and write the folder of the run.
 
-    Ctrl-C stops after the current update (status ``interrupted``); a second Ctrl-C stops at once. Then, or after an
+    Ctrl-C stops after the current update (status ``interrupted``); a second Ctrl-C stops at once. After a stop or an
     error, ``policy/`` has the best policy so far and ``policy-last/`` the latest; ``resume`` continues. The same
     recipe, scenario and seed give the same policy on the same machine, to the bit.
 
     Args:
         recipe: a recipe, its name, the path of its file, or a file's content.
-        scenario: likewise. Its roles say which vehicles learn.
+        scenario: a scenario, in any of the same forms. Its roles say which vehicles learn.
         directory: new folder of the run.
         scheme: how several learners train together; None: as in the recipe.
         seed: seed of worlds, networks and exploration; None: as in the recipe.
         steps: decisions of all learners together, rounded up to whole updates; None: as in the recipe.
         device: ``cpu``, or another one for which the algorithm has a variant, such as ``cuda``; None: as in the recipe.
         force: replace an earlier run in ``directory``.
-        settings: ``KEY=VALUE`` in which recipe and scenario differ from their files, for ``config.json``.
-        measure: function of a ``Training`` that returns a function from policies (learner -> policy) to metrics. The
-            latter is called before the first update, every few updates and at the end. Default: measure on the recipe's
+        settings: changes of recipe and scenario files, ``KEY=VALUE``; only recorded, in ``config.json``.
+        measure: function that takes a ``Training`` and returns a function from policies (learner -> policy) to metrics,
+            which is called before the first update, every few updates and at the end. Default: measure on the recipe's
             fixed list of worlds; None: never measure.
         on_progress: function that is called with each ``Progress``; ``show``: print it on stderr; None: no reports.
 
@@ -153,7 +153,7 @@ def resume(
         other_versions: accept a checkpoint of other versions of packages, or of another physics.
 
     Raises ``InvalidInput`` if the folder has no training or a finished one, if another process is training in it, if
-    ``config.json`` has changed since the checkpoint, or for other versions.
+    ``config.json`` has changed since the checkpoint, or if versions differ without ``other_versions``.
 
     """
     folder = RunFolder(directory)
@@ -235,7 +235,10 @@ def make_model(training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm
 
 
 def _learn(updates: BetweenUpdates, saved: Mapping[str, Any] | None) -> TrainResult:
-    """Train until the end or a stop, from the checkpoint ``saved`` on; save the policies, also after an error."""
+    """Train to the end, or until a stop; save the policies, also after an error.
+
+    ``saved``: checkpoint from which the training continues; None: begin.
+    """
     model, training, folder = updates.model, updates.training, updates.folder
     model.set_logger(Logger(str(folder.path), []))
     if saved is not None:
@@ -279,6 +282,7 @@ def _check_unfinished(folder: RunFolder, training: Training) -> None:
 
 
 def _check_same(folder: RunFolder, training: Training, saved: Mapping[str, Any], other_versions: bool) -> None:
+    """Raise ``InvalidInput`` if a checkpoint is of another training or, unless allowed, of other versions."""
     if saved["training"] != training.identity:
         raise InvalidInput(
             f"{folder.config}: this file was changed after the checkpoint of step {saved['steps']} was written; restore"

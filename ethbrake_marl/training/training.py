@@ -30,7 +30,7 @@ class Training(NamedTuple):
 
     @classmethod
     def of(cls, recipe: Any, scenario: AnyScenario, **changes: Any) -> Training:
-        """Training for a recipe and a scenario, given in any form that their ``load_...`` functions accept.
+        """Training for a recipe and a scenario, in any form that ``load_recipe`` and ``load_scenario`` accept.
 
         Learners observe what the recipe lists, or else what the scenario lists. ``changes``: other values for keys of
         the recipe. Raises ``InvalidInput`` if recipe and scenario do not fit each other.
@@ -52,7 +52,7 @@ class Training(NamedTuple):
 
     @property
     def drivers(self) -> dict[str, str]:
-        """Learner -> folder of its policy in the run."""
+        """Folder of each learner's policy inside the run's folder, learner -> path."""
         return {name: f"policy/{name}" if self.scheme == "independent" else "policy" for name in self.learners}
 
     @property
@@ -70,18 +70,18 @@ class Training(NamedTuple):
 
     @property
     def row(self) -> View:
-        """Features in a row of the environment: all features that some learner observes."""
+        """Features in the environment's observations: all features that some learner observes."""
         return View(list(dict.fromkeys(name for view in self.views for name in view.names)))
 
     @property
     def columns(self) -> list[list[int]]:
-        """For each learner, the columns of ``row`` that it observes."""
+        """For each learner, the columns of the environment's observations (``row``) that this learner observes."""
         place = {name: column for column, name in enumerate(self.row.names)}
         return [[place[name] for name in view.names] for view in self.views]
 
     @property
     def objective(self) -> str:
-        """What the learners minimise, such as ``own``; "" if it is the harm of the whole line."""
+        """Name of what learners minimise, such as ``own``; empty if it is the line's harm, or harm has no weight."""
         declared = self.recipe.reward.objective or self.scenario.objective
         objectives = objectives_of(declared, self.scenario.vehicles)
         is_total = all(objective.kind is OBJECTIVES["total"] for objective in objectives)
@@ -111,12 +111,13 @@ class Training(NamedTuple):
         }
 
     def who_drives(self) -> str:
-        """Text such as ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        """Text about which policy controls which vehicles: ``scheme shared: policy drives vehicle_2, vehicle_3``."""
         parts = (f"{self.drivers[group[0]]} drives {', '.join(group)}" for group in self.groups)
         return f"scheme {self.scheme}: {'; '.join(parts)}"
 
 
 def _check(recipe: TrainingRecipe, scenario: Scenario, scheme: Scheme, learners: Sequence[str]) -> None:
+    """Raise ``InvalidInput`` unless the scheme fits the number of learners, and the algorithm supports it."""
     where = f"scenario {scenario.name!r}"
     if not learners:
         raise InvalidInput(f"{where} has no learner; give at least one vehicle the role learner")

@@ -35,7 +35,11 @@ class TrainingDiverged(EthBrakeError, ArithmeticError):
 
 
 class BetweenUpdates(BaseCallback):
-    """Callback for the work before the first update, between updates and at the end of a training."""
+    """Callback for the work before the first update, between updates and at the end of a training.
+
+    ``evaluate``: function from policies to metrics; ``tell``: function called with the progress; ``stop``: whether the
+    training must stop.
+    """
 
     model: BaseAlgorithm
 
@@ -76,6 +80,7 @@ class BetweenUpdates(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
+        """Call ``work``; write a checkpoint if one is due. Raises ``Stopped`` if the training must stop."""
         due = bool(self.count) and self.count % self.training.recipe.checkpoint_every_updates == 0
         if self.restored:
             self.restored = due = False
@@ -108,7 +113,7 @@ class BetweenUpdates(BaseCallback):
             self.report()
 
     def keep_weights(self) -> None:
-        """Copy the current weights. Raises ``TrainingDiverged``."""
+        """Copy the current weights. Raises ``TrainingDiverged`` if they are not finite."""
         check_finite_model(self.model)
         self.weights = policy_weights(self.training, self.model)
         self.steps, self.updates = self.model.num_timesteps, self.count
@@ -139,6 +144,7 @@ class BetweenUpdates(BaseCallback):
             self.logger.dump(step=model.num_timesteps)
 
     def report(self) -> None:
+        """Report the progress to ``tell``, if there is such a function."""
         if self.tell is None:
             return
         recipe = self.training.recipe
@@ -169,7 +175,7 @@ class BetweenUpdates(BaseCallback):
         checkpoint.write(self.folder.checkpoints, {**marks, "course": course, "model": checkpoint.capture(self.model)})
 
     def restore(self, saved: Mapping[str, Any]) -> None:
-        """Continue from a checkpoint. Raises ``CorruptBundle`` if it does not fit this training."""
+        """Continue from a checkpoint. Raises ``CorruptBundle`` if the checkpoint does not fit this training."""
         course = saved["course"]
         try:
             checkpoint.restore(self.model, saved["model"])
@@ -224,13 +230,16 @@ def check_finite_model(model: BaseAlgorithm) -> None:
 
 
 def policy_weights(training: Training, model: BaseAlgorithm) -> list[dict[str, Float32s]]:
-    """Copy of the weights of each group's policy."""
+    """Copies of the policies' weights, one mapping name -> tensor for each group of learners."""
     algorithm = algorithm_of(training.recipe)
     return [algorithm.tensors(*pair) for pair in zip(algorithm.actors(model), training.networks, strict=True)]
 
 
 def make_policies(training: Training, steps: int, weights: Sequence[Mapping[str, Float32s]]) -> dict[str, Policy]:
-    """Learner -> policy after ``steps`` decisions, from the weights of each group's policy."""
+    """Policies after ``steps`` decisions, learner -> policy.
+
+    ``weights``: for each group of learners that share a policy, name of a tensor -> its entries.
+    """
     recipe, scenario = training.recipe, training.scenario
     policies: dict[str, Policy] = {}
     for learners, network, tensors in zip(training.groups, training.networks, weights, strict=True):

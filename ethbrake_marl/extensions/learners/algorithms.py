@@ -19,9 +19,10 @@ from ethbrake_marl.training.training import Training
 
 
 class Vine(Algorithm):
-    """Algorithm vine: one actor drives all learners."""
+    """Algorithm vine: one policy controls all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
+        """New model. Its weights are random, or those of the policy that the recipe's key ``start`` names."""
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
         model = self.new_model(training, environment)
@@ -43,7 +44,7 @@ class Vine(Algorithm):
 
 class RolloutClassification(Algorithm):
     def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
-        """New model, which brakes fully."""
+        """New model, whose untrained policy brakes fully."""
         return RolloutClassificationModel(training, environment)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:

@@ -34,7 +34,7 @@ class Moment(NamedTuple):
     number: int  # steps so far
 
     def ask(self, act: Act) -> Floats:
-        """Actions of one policy for all learners, [m, L] float64."""
+        """Actions of all learners, chosen by the policy ``act``, [m, L] float64."""
         return act(self.seen.reshape(-1, self.seen.shape[2])).astype(np.float64).reshape(self.seen.shape[:2])
 
 
@@ -44,8 +44,8 @@ Decide = Callable[[Moment], Floats]  # returns the learners' actions, [m, L]
 def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least: int = 0) -> tuple[Floats, State]:
     """Simulate episodes to the end; return each learner's discounted return, [n, L], and the last states.
 
-    ``decide``: returns the learners' actions at a ``Moment``. ``gamma``: discount per step. If harm is the reward's
-    only term, an episode also ends, after ``at_least`` steps, when no vehicle will ever move again.
+    ``decide``: function that returns the learners' actions at a ``Moment``. ``gamma``: discount per step. If harm is
+    the reward's only term, an episode also ends, after ``at_least`` steps, when no vehicle will ever move again.
     """
     learners, only_harm = game.settings.learners, set(game.rewarding.counted) <= {"harm"}
     gained, over = np.zeros((state.n, len(learners))), state.ended
@@ -68,9 +68,9 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
 def stands_for_good(before: State, after: State, weights: Floats) -> Bools:
     """Whether all vehicles of a world stand and will never move again, if actions depend only on observations, [n].
 
-    There nothing has changed in this step, and no vehicle waits for its latency or for news. ``weights`` [6] are
-    those of what counts as harm: a vehicle that presses against a standing one can still push it. Always False if
-    scripts, messages or a shield have a memory.
+    In such a world nothing has changed in this step, no vehicle waits for its latency or for a message, and no vehicle
+    presses against another, which it could still push; ``weights`` [6] of the count of harm reveal that. Always False
+    if scripts, messages or a shield have a memory.
     """
     out = np.zeros(after.n, np.bool_)
     if not after.memories:
@@ -82,6 +82,10 @@ def stands_for_good(before: State, after: State, weights: Floats) -> Bools:
 def find_standing(
     before: Floats, line: Floats, car: Floats, know: Floats, clock: Floats, weights: Floats, out: Bools
 ) -> None:
+    """Write to ``out`` [n] whether nothing changed in this step, and no vehicle waits for its latency or for a message.
+
+    ``before``, ``line``: the rows of ``State.line`` before and after the step (see ``stands_for_good``).
+    """
     bodies = line.shape[2]
     for k in range(len(out)):
         time = clock[k, TIME]
@@ -100,5 +104,5 @@ def find_standing(
 
 
 def moving(state: State) -> Bools:
-    """Whether a vehicle of a world moves, [n]."""
+    """Whether any vehicle of a world moves, [n]."""
     return np.asarray(state.line[:, SPEED].any(axis=1))

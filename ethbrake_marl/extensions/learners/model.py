@@ -50,7 +50,7 @@ class BranchingModel(BaseAlgorithm):
 
     @abstractmethod
     def improve(self, observations: Any, states: Any) -> None:
-        """Learn from the result of ``collect``."""
+        """Learn from the observations and states that ``collect`` returned."""
 
     def learn(
         self,
@@ -61,6 +61,7 @@ class BranchingModel(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
+        """Repeat ``collect`` and ``improve`` for ``total_timesteps`` decisions, with the calls of Stable-Baselines3."""
         total, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total:
@@ -73,7 +74,10 @@ class BranchingModel(BaseAlgorithm):
         return self
 
     def collect(self, callback: BaseCallback) -> tuple[Any, Any]:
-        """Drive all worlds for ``n_steps`` decisions; return their observations, [decisions L, F], and states."""
+        """Drive all n worlds for ``n_steps`` decisions.
+
+        Returns the observations, [n_steps n L, F], and the states, [n_steps n].
+        """
         all_observations, states, all_rows = [], [], np.arange(self.rows.n)
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs

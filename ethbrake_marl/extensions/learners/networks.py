@@ -73,12 +73,12 @@ class AveragedNetwork(nn.Module):
 
     @torch.no_grad()
     def best(self, observations: Float32s) -> Ints:
-        """Number of the largest output of ``average``, [rows], for observations [rows, F]."""
+        """Index of the largest output of ``average``, [rows], for observations [rows, F]."""
         chosen: Ints = self.average(torch.from_numpy(observations)).argmax(dim=1).numpy()
         return chosen
 
     def weights(self, name: str) -> dict[str, Tensor]:
-        """Averaged weights under their names in a policy file, which begin with ``name``."""
+        """Weights of ``average``, under names for a policy file that begin with ``name``."""
         linear = linear_layers(self.average)
         places = [f"{name}.{k}" for k in range(len(linear) - 1)] + [f"{name}.output"]
         layers = zip(places, linear, strict=True)
@@ -115,6 +115,6 @@ class ReplayBuffer(nn.Module):
 
 
 def draw_rows(rows: Ints, count: int) -> Ints:
-    """``count`` of the ``rows``, each at most once, in random order."""
+    """Sample of ``count`` of the ``rows``, without repetition; all of them, in random order, if there are fewer."""
     sample: Ints = rows[torch.randperm(len(rows))[:count].numpy()]
     return sample

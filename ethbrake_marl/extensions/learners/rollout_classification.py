@@ -31,24 +31,24 @@ FOR_GOOD = 2**31  # steps, more than an episode has
 
 
 class ChoiceBranches(NamedTuple):
-    """Simulations to the end, [M]: each begins at a decision with a choice, and leaves the rest to the network."""
+    """M simulations to the end. A branch begins at a decision with a choice; afterwards the network decides."""
 
-    decision: Ints  # 0 to B - 1
-    choice: Ints
-    steps: Ints  # for which the choice is held
+    decision: Ints  # [M] 0 to B - 1
+    choice: Ints  # [M] number of an action of the network
+    steps: Ints  # [M] for which the choice is held
 
     @classmethod
     def of(cls, candidates: Ints, steps: Ints, choices: int) -> tuple[ChoiceBranches, Ints]:
-        """One branch for each different choice of a decision, and the branches of ``candidates``, [B, C].
+        """One branch for each different choice at each decision; and the index of each candidate's branch, [B, C].
 
-        ``candidates`` [B, C] are numbers below ``choices``; those of a decision are held for ``steps`` [B].
+        ``candidates`` [B, C]: choices to try at B decisions, numbers below ``choices``, held for ``steps`` [B].
         """
         pairs, back = np.unique(np.arange(len(candidates))[:, np.newaxis] * choices + candidates, return_inverse=True)
         decision, choice = np.divmod(pairs, choices)
         return cls(decision, choice, steps[decision]), back.reshape(candidates.shape)
 
     def with_full_braking(self, decisions: int) -> ChoiceBranches:
-        """These branches, and then one for each of the decisions that brakes fully to the end."""
+        """These branches, followed by one branch for each decision in which the learner brakes fully to the end."""
         braking = np.arange(decisions), np.zeros(decisions, np.int64), np.full(decisions, FOR_GOOD)
         return ChoiceBranches(*(np.append(*parts) for parts in zip(self, braking, strict=True)))
 
@@ -92,13 +92,14 @@ class RolloutClassificationModel(BranchingModel):
     recipe: RolloutClassificationRecipe
 
     def new_policy(self) -> nn.Module:
-        """Network that takes choice 0 at first, full braking."""
+        """Network whose choice is 0, full braking, before any training."""
         return Chooser(len(self.features), self.recipe)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
 
     def improve(self, observations: Float32s, states: State) -> None:
+        """Try choices at visited decisions, store their extra costs, and train the network on stored decisions."""
         recipe, chooser = self.recipe, self.policy
         self._update_learning_rate(chooser.optimizer)
         rows, choices, costs = self.try_choices(observations, states)
@@ -120,7 +121,7 @@ class RolloutClassificationModel(BranchingModel):
         self.logger.record("train/loss", float(np.mean(losses)))
 
     def choices_at(self, observations: Float32s) -> Ints:
-        """Choices to try for observations ``observations`` [B, F], [B, C]; the network's own one first."""
+        """Choices to try at B decisions with the observations [B, F]: [B, C], the network's choice first."""
         recipe, last, count = self.recipe, self.recipe.network.choices - 1, len(observations)
         best_choices = self.policy.best(observations)
         choices = [best_choices]
@@ -135,8 +136,8 @@ class RolloutClassificationModel(BranchingModel):
     def try_choices(self, observations: Float32s, states: State) -> tuple[Ints, Ints, Floats]:
         """Try C choices at B visited decisions, each in a branch that is simulated to the end.
 
-        Returns the numbers of the decisions, [B], the choices, [B, C], and their costs, [B, C]: minus the return,
-        changed by the recipe's key ``caution``.
+        Returns the indices of the decisions, [B], the choices, [B, C], and their costs, [B, C]: minus the return, plus
+        the further cost of the recipe's key ``caution``.
         """
         recipe = self.recipe
         rows = draw_rows(np.flatnonzero(moving(states).repeat(self.learners)), recipe.tried)
@@ -151,7 +152,10 @@ class RolloutClassificationModel(BranchingModel):
         return rows, tried_choices, costs
 
     def costs_of(self, states: State, rows: Ints, branches: ChoiceBranches) -> Floats:
-        """Cost of each branch, [M]: minus the return of the learner that decides. ``rows`` [B]: its decisions."""
+        """Cost of each branch, [M]: minus the return of the learner whose choice is tried.
+
+        ``rows`` [B]: indices of the decisions among all visited ones.
+        """
         chooser, learners = self.policy, self.learners
         world, learner = np.divmod(rows[branches.decision], learners)
 

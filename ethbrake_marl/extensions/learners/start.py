@@ -15,10 +15,10 @@ from ethbrake_marl.policies.policy import Policy
 
 
 def starting_policy(name: str, recipe: str) -> Policy:
-    """Policy of an agent's name such as ``ppo`` or ``policy@runs/mine``.
+    """Policy behind an agent's name such as ``ppo`` or ``policy@runs/mine``.
 
-    ``recipe`` is for error messages. Raises the errors of ``make_agent``, and ``InvalidInput`` for an agent that is no
-    policy.
+    ``recipe``: name of the recipe, for error messages. Raises the errors of ``make_agent``, and ``InvalidInput`` for an
+    agent that is no policy.
     """
     driver = make_agent(name)
     if not isinstance(driver, LearnedAgent):
@@ -27,9 +27,10 @@ def starting_policy(name: str, recipe: str) -> Policy:
 
 
 def start_weights(policy: Policy, network: NetworkSpec, features: Sequence[str], recipe: str) -> dict[str, Float32s]:
-    """Weights of ``policy`` for a network ``network`` that observes ``features``.
+    """Weights of ``policy`` for the network ``network``, which observes ``features``.
 
-    Raises ``InvalidInput`` for other layers, and if ``features`` lack one that the policy observes.
+    Raises ``InvalidInput`` if the network has other layers than the policy, or if ``features`` lack a feature that the
+    policy observes.
     """
     for name in ("policy_hidden", "activation", "output"):
         if getattr(policy.manifest.network, name) != getattr(network, name):
@@ -47,7 +48,7 @@ def start_weights(policy: Policy, network: NetworkSpec, features: Sequence[str],
 
 
 def widened(policy: Policy, features: Sequence[str]) -> dict[str, Float32s]:
-    """Weights of the actor for observations ``features``, with weight 0 for those that it did not know."""
+    """Weights of the policy's actor for observations ``features``; 0 for features that the policy did not observe."""
     tensors = {name: tensor.copy() for name, tensor in policy.tensors.items() if name.startswith("policy.")}
     first = np.zeros((len(tensors["policy.0.weight"]), len(features)), np.float32)
     first[:, [list(features).index(name) for name in policy.observation.names]] = tensors["policy.0.weight"]

@@ -38,7 +38,7 @@ class ClippedActor(AveragedNetwork):
 
     @torch.no_grad()
     def means(self, observations: Float32s) -> Float32s:
-        """Outputs of the network that is being trained (not of its average), [rows], for [rows, F]."""
+        """Outputs of the network in training (not of its average), [rows], for observations [rows, F]."""
         means: Float32s = self.learning(torch.from_numpy(observations))[:, 0].numpy()
         return means
 
@@ -50,9 +50,9 @@ class Branches(NamedTuple):
     """Two branches of each of B visited decisions: first B with a higher action, then B with a lower one."""
 
     world: Ints  # [2B] number of the visited state
-    learner: Ints  # [2B] whose action is moved, from 0
-    size: Floats  # [2B] by how much
-    steps: Ints  # [2B] for how many steps
+    learner: Ints  # [2B] learner whose action is moved, from 0
+    size: Floats  # [2B] by how much the action is moved
+    steps: Ints  # [2B] for how many steps the action is moved
 
     def decisions(self, learners: int) -> Ints:
         return (self.world * learners + self.learner)[: len(self.world) // 2]
@@ -80,7 +80,9 @@ class VineModel(BranchingModel):
         self.train_actor(self.try_out(observations, states))
 
     def try_out(self, observations: Float32s, states: State) -> TrialResults:
-        """Draw visited decisions; simulate a branch with a higher and one with a lower action than the policy's."""
+        """Draw visited decisions; simulate one branch of each with a higher action than the policy's, and one with a
+        lower.
+        """
         branches = self.draw_branches(np.flatnonzero(moving(states).repeat(self.learners)))
         gained, moved = self.play(states, branches)
         sample = observations[branches.decisions(self.learners)]
@@ -95,7 +97,8 @@ class VineModel(BranchingModel):
         return Branches(world, learner, np.concatenate([sizes, -sizes]), np.tile(self.drawn_steps(len(rows)), 2))
 
     def play(self, states: State, branches: Branches) -> tuple[Floats, Floats]:
-        """Simulate branches to the end; return their learners' returns, and how far actions were moved, [2B] each.
+        """Simulate branches to the end; return each branch's return of its learner, and how far actions were moved,
+        [2B] each.
 
         An action stays in [-1, 1], so it may move by less than ``size``. Moves are summed over the steps.
         """
@@ -116,7 +119,10 @@ class VineModel(BranchingModel):
         return gained[np.arange(len(size)), learner], moved
 
     def measured_gradient(self, gained: Tensor, moved: Tensor) -> Tensor:
-        """Gradient at each decision, [B] float32, from the returns and moves of its two branches, [2B]."""
+        """Gradient of the return at each decision, [B] float32, limited to the recipe's ``gradient_limit``.
+
+        ``gained``, ``moved`` [2B]: return of each branch, and how far its actions were moved.
+        """
         (up, down), (higher, lower) = gained.chunk(2), moved.chunk(2)
         measured = (up - down) / (higher - lower)
         gradient = measured.clamp(-self.recipe.gradient_limit, self.recipe.gradient_limit)
@@ -125,6 +131,7 @@ class VineModel(BranchingModel):
         return gradient.float()
 
     def train_actor(self, results: TrialResults) -> None:
+        """Train the actor by gradient descent towards its ``trusted_targets``."""
         recipe = self.recipe
         self._update_learning_rate(self.policy.optimizer)
         lesson, losses = (results.seen, *trusted_targets(results, recipe.trust_radius, recipe.anchor)), []

@@ -1,4 +1,4 @@
-"""Agents that decide everything at the alert: ``best_harm``, and ``AGENT+search`` around another agent's commands."""
+"""Agents that choose all commands at the alert: ``best_harm``, and ``AGENT+search``, which improves another agent's."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 SEARCH_CANDIDATES = 500  # plans that +search simulates
 MOST_CANDIDATES = 1_000_000
-START = {"honest": "universal"}  # count -> policy whose episode a search also starts from,
-OTHER_START = "ppo"  # and that of every other count
+START = {"honest": "universal"}  # count -> policy whose commands ``best_harm`` improves, too
+OTHER_START = "ppo"  # the policy for every other count
 DECISION_ROUNDING = 1e-6  # part of a step: a time this close before a decision counts as the decision
 
 
@@ -39,7 +39,7 @@ class SearchMemory(NamedTuple):
 class Planner:
     """Agent that chooses all its commands at the alert and then gives them, assuming that other learners brake fully.
 
-    If they do, its memory's ``predicted_harm`` is the harm that happens, to the last bit.
+    If they do brake fully, the harm that happens is the memory's ``predicted_harm``, to the last bit.
     """
 
     knows = MODEL
@@ -55,7 +55,7 @@ class Planner:
         return SearchMemory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        """Vehicle ``body``'s commands at every decision, [n, T] m/s2, and what they cost, [n] m2/s2."""
+        """Commands of vehicle ``body`` at every decision, [n, T] m/s2, and what they cost, [n] m2/s2."""
         raise NotImplementedError
 
     def act(self, state: State, memory: SearchMemory, body: int) -> tuple[Floats, SearchMemory]:
@@ -69,8 +69,8 @@ class Planner:
 class BestHarm(Planner):
     """Agent that drives the best known commands: from a shipped table, or from a search.
 
-    A search begins with E-V2X-BM. If this vehicle is the only learner, the better of its result and of a shipped
-    policy's episode is improved once more, so the agent never does more harm than either.
+    A search begins with the choice of E-V2X-BM. If the agent is the only learner, the better of the search's result and
+    a shipped policy's commands is improved once more, so the agent never does more harm than either.
     """
 
     def __init__(
@@ -80,7 +80,9 @@ class BestHarm(Planner):
         self.budget = budget
 
     def check(self, game: Game, body: int) -> None:
-        """Warn (``Unfamiliar``) if the scenario's table is of other physics, so that every world must be searched."""
+        """Warn (``Unfamiliar``) if the scenario's table was made for other physics, so that every world must be
+        searched.
+        """
         outdated = outdated_tables()
         if game.name in outdated:
             warnings.warn(f"{self.name}: searches every world: {outdated[game.name]}", Unfamiliar, stacklevel=2)
@@ -97,6 +99,7 @@ class BestHarm(Planner):
         return commands, harm
 
     def search(self, game: Game, alert: State, problem: Problem, body: int, steps: int) -> tuple[Floats, Floats]:
+        """Best commands of vehicle ``body`` by a search, [n, ``steps``] m/s2, and what they cost, [n] m2/s2."""
         profiles, values = search_profiles(problem, [e_v2x_bm_profiles(problem, alert)], budget=self.budget)
         best = profiles.stepwise(steps)[:, :, 0]
         if self.scenario.learners != (body,):
@@ -134,9 +137,9 @@ class SearchAround(Planner):
 
 
 def single_learner_game(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
-    """Game with ``body`` as its only learner, while other learners brake fully, and its worlds at the alert.
+    """Game whose only learner is vehicle ``body``, and its worlds at the alert, in which other learners brake fully.
 
-    Raises ``InvalidInput`` if an agent drives another vehicle, because its commands are not known at the alert.
+    Raises ``InvalidInput`` if the role of another vehicle is an agent whose commands are not known at the alert.
     """
     for vehicle, role in enumerate(scenario.roles.values(), 1):
         if vehicle != body and role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):

@@ -43,12 +43,12 @@ def best_harm(
 ) -> BestHarmTable:
     """Search worlds at the alert for the profile (commands over time) of least harm; return a table.
 
-    The harm is at most that of every profile in ``first_profiles``, and of one vehicle's best constant deceleration.
-    With several vehicles it is at most what the same search reaches with one of them, while the others brake fully. A
-    world's result depends on no other world.
+    A world's harm is at most that of its profiles in ``first_profiles``, and of any controlled vehicle's best constant
+    deceleration. With several vehicles it is at most what the same search reaches with one of them, while the others
+    brake fully. The result of a world does not depend on other worlds.
 
     Args:
-        game: rules of the episodes.
+        game: game of the worlds' scenario.
         alert: worlds at the alert.
         counts: counts of harm to search, one after the other (``episode.counts``). A profile found for one count is
             also tried for the others.
@@ -57,8 +57,8 @@ def best_harm(
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
         first_profiles: profiles that are tried first, [n] each, with any number of phases.
-        objective: whose harm is minimised, in each count, as under a scenario's key ``objective``; ``total``: the sum
-            over the line. The table holds its values.
+        objective: what is minimised, in each count, as in a scenario's key ``objective``; ``total``: the harm of the
+            line. The table holds the values of this objective.
 
     Raises ``InvalidInput`` for other counts, bodies or objectives, for a budget below 1 and for physics without exact
     impacts.
@@ -102,9 +102,9 @@ def _search(
 
 
 def starting_profiles(problem: Problem, alert: State, first_profiles: Sequence[Profiles] = ()) -> list[Profiles]:
-    """Profiles with which a search begins: constant commands, ``first_profiles``, and for a single vehicle some more.
+    """Profiles with which a search begins: constant commands and ``first_profiles``.
 
-    These are E-V2X-BM's choice and profiles of full driving and full braking.
+    For a single controlled vehicle also E-V2X-BM's choice, and profiles of full driving and full braking.
     """
     starts = [problem.constant(problem.even_grid(SEARCH_CONSTANTS)), *first_profiles]
     if len(problem.bodies) > 1:
@@ -133,12 +133,12 @@ def search_list(
     """Run ``best_harm`` on a long list of worlds, part by part; an interrupted run continues where it stopped.
 
     Args:
-        game: rules of the episodes.
+        game: game of the worlds' scenario.
         alert: worlds at the alert.
-        chunks: folder in which finished parts are stored, and read if they are of the same search. None: no files.
+        chunks: folder for the files of finished parts, which a later run of the same search reads. None: no files.
         on_progress: called with the number of finished worlds, and of all.
         known_table: a table of the same vehicles, whose profiles are tried first.
-        teams: agents whose commands are tried first, too.
+        teams: teams whose commands are also tried first.
         bodies: as for ``best_harm``.
         threads: as for ``best_harm``.
         options: other arguments of ``best_harm``.
@@ -178,7 +178,10 @@ def search_list(
 
 
 def agent_commands(problem: Problem, game: Game, alert: State, team: Team) -> Floats:
-    """Let a team drive; return its commands at every decision of a problem, [n, T, B] m/s2, the last ones repeated."""
+    """Commands of a team that drives the worlds, at every decision of ``problem``, [n, T, B] m/s2.
+
+    After the end of the episodes, the last commands are repeated.
+    """
     bodies, states = sorted(team.drivers), play(game, alert, team)
     next(states)
     commands = np.stack([state.wanted[:, bodies] for _, state in states], axis=1)
@@ -186,6 +189,6 @@ def agent_commands(problem: Problem, game: Game, alert: State, team: Team) -> Fl
 
 
 def driven_profiles(problem: Problem, game: Game, alert: State, team: Team) -> Profiles:
-    """Let a team drive; return its commands as profiles with one phase for each change of command."""
+    """Commands of a team that drives the worlds, as profiles with one phase for each change of command."""
     steps = Profiles.of_steps(agent_commands(problem, game, alert, team), problem.last_step)
     return Profiles.join([compact(*profile) for profile in zip(*steps, strict=True)])

@@ -17,18 +17,18 @@ from ethbrake_marl.extensions.search.search import prepare_world, random_states
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import Floats
 
-KEPT_PROFILES = 12  # profiles of each world
+KEPT_PROFILES = 12  # profiles that are returned for each world
 LATEST_S = 2.0  # latest first change of command, in the first round
 TIMES = 24  # first changes that are tried in each round
 EXTREME_ROUNDS = 3  # each closer to the best time so far
 EXTREME_PHASES = 5
-WAYS = ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5))  # steps by which the second change comes early, and the share in it
+WAYS = ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5))  # (`early`, `share`) in `write_extreme`
 
 
 def extreme_profiles(problem: Problem) -> Profiles:
     """Best profiles of full driving and full braking for one controlled vehicle, [n * KEPT_PROFILES], world by world.
 
-    The meetings with its neighbours are computed as if these braked fully. In worlds without neighbours, or with a
+    The contacts with its neighbours are predicted as if these braked fully. In worlds without neighbours, or with a
     vehicle that moves backward, the profiles coast.
     """
     (body,), n, last = problem.bodies.tolist(), problem.n, problem.last_step
@@ -59,12 +59,13 @@ def extreme_profiles(problem: Problem) -> Profiles:
 
 @large
 def write_extreme(kind, change, meeting, early, share, step, last, low, high, ends, commands):
-    """Write the extreme profile that changes its command at ``change`` (s) and at ``meeting`` (s).
+    """Write the profile that changes from one extreme command to the other at ``change`` (s), and back at ``meeting``
+    (s).
 
-    It is written to ``ends`` [5] and ``commands`` [5, 1]. ``kind`` 0 drives, brakes and drives; 1 brakes, drives and
-    brakes. Commands can change only between steps of ``step`` s: in the step of the first change the command is the
-    mean of both, so that the speed after the step is exact. The second change is ``early`` steps earlier, with the
-    ``share`` of the last command in its step. ``last``: last step. ``low``, ``high``: full braking and full driving
+    The profile is written to ``ends`` [5] and ``commands`` [5, 1]. ``kind`` 0 drives, brakes and drives; 1 brakes,
+    drives and brakes. Commands can change only between steps of ``step`` s: in the step of the first change the command
+    is the mean of both, so that the speed after the step is exact. The second change is ``early`` steps earlier, with
+    the ``share`` of the last command in its step. ``last``: last step. ``low``, ``high``: full braking and full driving
     (m/s2).
     """
     first, second = (high, low) if kind == 0 else (low, high)

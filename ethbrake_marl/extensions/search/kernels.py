@@ -24,7 +24,7 @@ from ethbrake_marl.motion.layout import Floats, Ints
 OTHER_WEIGHT = 1e-8  # weight of the other count of harm in what is minimised: it decides ties
 RESOLUTION = 1048576.0  # commands are multiples of 1 / 2^20 m/s2: short to store and exactly repeatable
 
-# numbers of a world
+# places in `World.numbers`
 TIME_STEP, AIM, STEPWISE, NUMBERS = range(4)
 
 # how random profiles and changes are drawn: a whole profile, or three phases of a plan and changes of a few steps
@@ -40,6 +40,8 @@ MOVE_END = 3  # moves the border between two phases by whole steps
 
 
 class World(NamedTuple):
+    """Data of one world for the search."""
+
     car: Floats  # [CAR_ROWS, N + 1]
     clock: Floats  # [CLOCK_COLUMNS] at the first decision
     wanted: Floats  # [N + 1] commands of all bodies (m/s2); overwritten
@@ -47,7 +49,7 @@ class World(NamedTuple):
     bounds: Floats  # [B, 2] their smallest and largest command (m/s2)
     shares: Floats  # [3, N + 1], as in `Problem`
     numbers: Floats  # [NUMBERS] time step (s), aim, whether step by step
-    weights: Floats  # [2, 6] of the count that is minimised, and of the one that decides ties
+    weights: Floats  # [2, 6] of the count of harm that is minimised, and of the count that decides ties
     random: UInt64s  # [1] state of the random stream
     scratch: Floats  # of the physics
 
@@ -63,6 +65,8 @@ class Room(NamedTuple):
 
 
 class Field(NamedTuple):
+    """The best M profiles of one world so far."""
+
     ends: Ints  # [M, K]
     commands: Floats  # [M, K, B]
     phases: Ints  # [M] number of phases in use; 0: an empty place
@@ -71,9 +75,9 @@ class Field(NamedTuple):
 
 @kernel
 def search_value(world, line):
-    """What the search minimises (m2/s2), plus a little of the other count of harm, which decides ties.
+    """What the search minimises (m2/s2), plus a little of another count of harm, which decides ties.
 
-    ``world``: a ``World``. ``line`` [LINE_ROWS, N + 1]: the present state of its bodies.
+    ``world``: a ``World``. ``line`` [LINE_ROWS, N + 1]: the state of its bodies, with the harm so far.
     """
     aim = world.numbers[AIM]
     return worth(line, world.shares, world.weights[0], aim) + OTHER_WEIGHT * amount_so_far(line, world.weights[1])
@@ -148,9 +152,9 @@ def limit_command(command, low, high):
 
 @large
 def draw_command(world, b):
-    """Random command (m/s2) of the controlled vehicle number ``b`` of a ``World``.
+    """Random command (m/s2) of the vehicle ``bodies[b]`` of a ``World``.
 
-    Likely are full braking, full driving, 0, and the command of the vehicle ahead.
+    Often it is full braking, full driving, 0, or the command of the vehicle ahead.
     """
     random, body, low, high = world.random, world.bodies[b], world.bounds[b, 0], world.bounds[b, 1]
     u = next_uniform(random)
@@ -169,8 +173,9 @@ def draw_command(world, b):
 def draw_profile(world, drawing, ends, commands):
     """Write a random profile to ``ends`` [K] and ``commands`` [K, B]; return its number of phases.
 
-    ``world`` is a ``World``, ``drawing`` [DRAWING] says how to draw. A profile has six phases of random commands,
-    mostly short ones. A plan has three: often full braking, another command for a while, and full braking.
+    ``world`` is a ``World``, ``drawing`` [DRAWING] says how to draw. The kind PROFILE has six phases of random
+    commands, most of them short. The kind PLAN has three: often full braking, another command for a while, and full
+    braking.
     """
     random, bounds, last = world.random, world.bounds, int(world.clock[LAST])
     if drawing[KIND] == PLAN:
@@ -197,7 +202,7 @@ def draw_profile(world, drawing, ends, commands):
 def draw_change(world, active, drawing, change):
     """Write a random change of one of the first ``active`` phases of a profile to ``change`` [CHANGE].
 
-    ``world`` is a ``World``, ``drawing`` [DRAWING] says how to draw. Amounts are log-uniform.
+    ``world`` is a ``World``, ``drawing`` [DRAWING] says how to draw. The logarithm of an amount is uniform.
     """
     random, bounds = world.random, world.bounds
     if drawing[KIND] == PLAN:
@@ -272,11 +277,11 @@ def largest_place(values):
 
 @large
 def gather(world, room, ends, commands, phases, random_count, drawing, tolerance, field):
-    """Fill ``field`` with the best of the given profiles [Q, K] and of ``random_count`` random ones, in any order.
+    """Fill ``field`` with the best of Q profiles and of ``random_count`` random ones, in any order.
 
-    ``phases`` [Q]: their numbers of phases. Of profiles whose values differ by less than ``tolerance`` (m2/s2), only
-    the first is kept. ``world``, ``room``, ``field``: a ``World``, ``Room``, ``Field``. ``drawing``: as for
-    ``draw_profile``.
+    ``ends`` [Q, K], ``commands`` [Q, K, B], ``phases`` [Q] (number of phases; 0: empty place): the Q profiles. Of
+    profiles whose values differ by less than ``tolerance`` (m2/s2), only the first is kept. ``world``, ``room``,
+    ``field``: a ``World``, ``Room``, ``Field``. ``drawing``: as for ``draw_profile``.
     """
     worst, number = 0, ends.shape[0]
     begin = min(worst, number)  # 0, but no literal: numba would compile the physics again for it
@@ -307,9 +312,9 @@ def improve(world, room, ends, commands, budget, drawing, least):
     """Improve a profile in place by at most ``budget`` random changes, until its value is at most ``least``.
 
     ``world``, ``room``: a ``World``, ``Room``. ``ends`` [K], ``commands`` [K, B]: the profile. ``drawing``: as for
-    ``draw_profile``. Returns its value (m2/s2), infinite if it cannot be simulated, and the number of phases until its
-    episode ends. A change that helps is tried again with twice the amount. A change without effect costs no budget,
-    except in plans.
+    ``draw_profile``. Returns the profile's value (m2/s2), infinite if the profile cannot be simulated, and the number
+    of phases until the episode ends. A change that helps is tried again with twice the amount. A change without effect
+    costs no budget, except in plans.
     """
     change, lines, trial_lines = room.change, room.lines, room.tried
     new_ends, new_commands = room.ends[: ends.shape[0]], room.commands[: ends.shape[0]]

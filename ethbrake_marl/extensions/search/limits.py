@@ -16,7 +16,7 @@ from ethbrake_marl.registry import Part
 
 
 def least_known_values(game: Game, alert: State) -> dict[str, Floats]:
-    """Least known value of each count, count -> [n] m2/s2.
+    """Least known value of each count of harm in each world, count -> [n] m2/s2, from the shipped tables.
 
     The honest cost is included only if it is known in all worlds. Raises ``InvalidInput`` if the least harm of a world
     is in no shipped table.

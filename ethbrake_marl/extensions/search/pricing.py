@@ -1,8 +1,8 @@
-"""Which harm do given commands lead to? Profiles of commands, and problems: worlds in which the best is searched.
+"""Which harm do commands lead to? Profiles of commands, and problems: worlds whose best commands are searched.
 
 A *profile* holds the commands of the controlled vehicles from the first decision to the horizon: K phases, each with
-constant commands. Phases begin and end at decisions, so agents can follow a profile, and its harm is the harm that then
-happens, to the last bit. B is the number of controlled vehicles.
+constant commands. Phases begin and end at decisions, so agents can follow a profile, and its predicted harm is the harm
+that then happens, to the last bit. B is the number of controlled vehicles.
 """
 
 from __future__ import annotations
@@ -44,8 +44,20 @@ from ethbrake_marl.motion.layout import (
 
 UInt64s = NDArray[np.uint64]
 
-MOST_PHASES = 12  # of a profile, before it is polished at every decision,
-FEW_ENDS = 1, 2, 3, 4, 6, 8, 11, 14, 18, 23, 30  # and where they end, up to the last, in one that is shortened
+MOST_PHASES = 12  # of a profile in a search, before every decision is a phase
+FEW_ENDS = (
+    1,
+    2,
+    3,
+    4,
+    6,
+    8,
+    11,
+    14,
+    18,
+    23,
+    30,
+)  # decisions at which phases of a shortened profile end, but for the last
 
 # what a search minimises
 WHOLE_LINE = 0.0  # harm of the line
@@ -72,7 +84,10 @@ class Profiles(NamedTuple):
         return np.take_along_axis(self.commands_mps2, phase[:, :, np.newaxis], 1)
 
     def shorten(self) -> Profiles:
-        """Profiles with ``MOST_PHASES`` phases. Those of a longer one have its command at their beginning."""
+        """Profiles with ``MOST_PHASES`` phases.
+
+        Of a longer profile only some decisions are kept; their commands hold until the next of them.
+        """
         ends, commands = Profiles.pad([self], MOST_PHASES)[0]
         fits = ends[:, MOST_PHASES - 1] == ends[:, -1]
         few = np.minimum(np.array([*FEW_ENDS, np.iinfo(np.int64).max]), ends[:, -1:])
@@ -107,7 +122,10 @@ class Profiles(NamedTuple):
 
 
 def best_of(results: Sequence[tuple[Floats, Profiles]]) -> tuple[Floats, Profiles]:
-    """Least of several harms [n] in each world, and its profile. ``results``: pairs; ties: the first."""
+    """Least of several harms in each world, [n], and its profile, [n]; of equal harms the first.
+
+    ``results``: pairs of harms [n] and their profiles [n].
+    """
     harms = np.stack([harm for harm, _ in results])
     pick, rows = harms.argmin(axis=0), np.arange(harms.shape[1])
     padded_profiles = Profiles.pad([profiles for _, profiles in results])
@@ -139,7 +157,7 @@ class Problem(NamedTuple):
 
     @property
     def last_step(self) -> Ints:
-        """Number of decisions before the end, [n]."""
+        """Number of decisions from the first one to the horizon, [n]."""
         return self.state.clock[:, LAST].astype(np.int64)
 
     @property
@@ -161,9 +179,10 @@ class Problem(NamedTuple):
         return np.minimum(low + share * (high - low), high)
 
     def constant(self, commands_mps2: Floats) -> Profiles:
-        """Profiles with constant commands [n, Q, B], as [n * Q]: first the Q profiles of world 0, and so on.
+        """Profiles that hold the commands ``commands_mps2`` [n, Q, B], as [n * Q]: first the Q profiles of world 0, and
+        so on.
 
-        Each consists of several phases with the same command, which a search can change one by one.
+        A profile has several phases with the same command, which a search can change one by one.
         """
         n, Q, B = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
@@ -177,8 +196,8 @@ class Problem(NamedTuple):
     def follow(self, profiles: Profiles) -> State:
         """Simulate the episodes in which the controlled vehicles follow ``profiles``; return their last states.
 
-        They have the bits of the episodes in which agents give these commands. Raises ``InvalidInput`` as ``check``
-        does, and ``PhysicsError`` if a check of the physics fails.
+        The states have the same bits as if agents gave these commands. Raises ``InvalidInput`` as ``check`` does, and
+        ``PhysicsError`` if a check of the physics fails.
         """
         self.check(profiles)
         line, car, clock, know, wanted, memories = self.state
@@ -194,13 +213,16 @@ class Problem(NamedTuple):
         return State(line, car, clock, know, wanted, memories)
 
     def value(self, last: State, count: str | None = None) -> Floats:
-        """What the search minimises if episodes end in ``last``, [n] m2/s2; if given, in another ``count``."""
+        """What the search minimises, for episodes with the last states ``last``, [n] m2/s2.
+
+        ``count``: count of harm; None: the problem's.
+        """
         value, weights = np.empty(self.n), weights_of(self.harm_count if count is None else count)
         worths(last.line, self.shares, weights, self.aim, value)
         return value
 
     def values(self, profiles: Profiles) -> dict[str, Floats]:
-        """``value`` in each count of harm if the vehicles follow ``profiles``: count -> [n] m2/s2."""
+        """What the search minimises if the vehicles follow ``profiles``, in every count of harm: count -> [n] m2/s2."""
         last = self.follow(profiles)
         return {count: self.value(last, count) for count in COUNTS}
 
@@ -256,7 +278,7 @@ def problem_of(
     vehicles whose shortest latency is the time of the first decision; None: ``bodies``.
 
     Raises ``InvalidInput`` for vehicles that do not exist, an unknown count, an objective that is not a weighted sum of
-    harm or ``maximin``, and a script that looks at the state, whose commands are not known at the alert.
+    harm or ``maximin``, and a script that observes the state, whose commands are not known at the alert.
     """
     check_exact(alert, "a search for the best braking")
     check_count("count", count)
@@ -281,17 +303,18 @@ def problem_of(
 
 
 def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
-    """Worlds at the alert in which some vehicles brake fully, whatever their roles say."""
+    """Worlds at the alert in which the vehicles ``bodies`` brake fully, whatever their roles say."""
     wanted = alert.wanted.copy()
     wanted[:, bodies] = -capacities(alert.car, BRAKING, alert.time_s)[:, bodies]
     return alert._replace(wanted=wanted)
 
 
 def beside_braking(problem: Problem, single_problem: Problem, profiles: Profiles) -> Profiles:
-    """Profiles of all controlled vehicles of a problem: one follows ``profiles``, the others brake fully.
+    """Profiles for ``problem`` in which one vehicle follows ``profiles`` and the other controlled vehicles brake fully.
 
-    ``single_problem``: the problem of this one vehicle, in the same worlds. Its first decision may be later, because
-    its latency is longer; if its decisions are not also decisions of ``problem``, they are rounded to the nearest ones.
+    ``single_problem``: the problem of this vehicle alone, in the same worlds, with the solutions ``profiles``. Its
+    first decision may be later, because the vehicle's latency is longer; decisions that are not decisions of
+    ``problem`` are rounded to the nearest of these.
     """
     later = single_problem.state.clock[:, FIRST_DECISION] - problem.state.clock[:, FIRST_DECISION]
     last = problem.last_step[:, np.newaxis]
@@ -329,7 +352,7 @@ def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
 
 
 def with_objective(problem: Problem, objective: Declared) -> Problem:
-    """Problem with ``objective``, as under a scenario's key, as what its search minimises.
+    """Problem whose search minimises ``objective``, given as in a scenario's key ``objective``.
 
     Raises ``InvalidInput`` if the controlled vehicles' objective is neither a weighted sum of harm nor ``maximin``, or
     differs among them.
@@ -352,10 +375,10 @@ def with_objective(problem: Problem, objective: Declared) -> Problem:
 
 @kernel
 def worth(line, shares, weights, aim):
-    """What a search minimises (m2/s2) in one world. It never decreases during an episode.
+    """What a search minimises (m2/s2), in one world at one time. The value never decreases during an episode.
 
-    ``line`` [LINE_ROWS, N + 1]: the present state. ``shares`` [3, N + 1], ``aim``: as in ``Problem``. ``weights`` [6]:
-    of the count of harm.
+    ``line`` [LINE_ROWS, N + 1]: the state, with the harm so far. ``shares`` [3, N + 1], ``aim``: as in ``Problem``.
+    ``weights`` [6]: of the count of harm.
     """
     if aim == WHOLE_LINE:
         return amount_so_far(line, weights)
@@ -379,9 +402,10 @@ def worths(line, shares, weights, aim, out):
 
 @large
 def follow_worlds(line, car, clock, wanted, ends, commands, bodies, time_step_s, scratch, failed):
-    """Simulate every profile in place, decision by decision. ``failed`` [n]: a check of the physics failed.
+    """Simulate every world's profile to the end, decision by decision; change ``line``, ``clock``, ``wanted`` in place.
 
-    ``line``, ``car``, ``clock``, ``wanted``: as in ``State``. ``ends``, ``commands``: as in ``Profiles``.
+    These and ``car`` are as in ``State``; ``ends``, ``commands`` as in ``Profiles``. ``failed`` [n] becomes True where
+    a check of the physics failed.
     """
     for k in range(len(failed)):
         phase = 0

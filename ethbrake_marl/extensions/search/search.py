@@ -32,18 +32,18 @@ LONGEST_WHILE_S = 0.8  # of the second command of a template
 WORSE = 5.0  # a template is improved if it is worse than the given commands by at most this (m2/s2)
 NO_HARM = 1e-9  # less (m2/s2) counts as none
 
-PROFILES = np.zeros(DRAWING, np.int64)  # random profiles and changes are those of profiles
+PROFILES = np.zeros(DRAWING, np.int64)  # `drawing` of the kind PROFILE
 
 
 def search_profiles(
     problem: Problem, starts: Sequence[Profiles], *, budget: int, seed: int = 0, threads: int = 1
 ) -> tuple[Profiles, dict[str, Floats]]:
-    """Search each world for the best profile; return it, and what it costs, count -> [n] m2/s2.
+    """Search each world for the best profile; return the profiles, and what they cost, count -> [n] m2/s2.
 
-    It is at least as good as each of the profiles ``starts``, [n * Q] each: first the Q profiles of world 0, and so on.
+    They are at least as good as the profiles ``starts``, [n * Q] each: first the Q profiles of world 0, and so on.
     ``budget`` is about the number of profiles that are simulated in each world. The result does not depend on the
-    number of threads. At last the best is polished: its commands are changed at every decision, of one vehicle also at
-    several decisions at once.
+    number of threads. Finally the best profile is polished: its commands are changed at single decisions and, if one
+    vehicle is controlled, also at several decisions at once.
 
     Raises ``InvalidInput`` for a bad number, and ``PhysicsError`` for worlds in which no profile can be simulated.
     """
@@ -91,7 +91,10 @@ def search_profiles(
 
 
 def join_profiles(parts: Sequence[Profiles], n: int) -> Profiles:
-    """Join lists of profiles of as many phases, each [n * q] (q may differ), into one list for each world, [n, Q]."""
+    """Profiles of all ``parts``, which have [n * q] each, arranged by world, [n, Q].
+
+    q may differ between parts, but not the number of phases.
+    """
     K, B = parts[0].commands_mps2.shape[1:]
     ends = np.concatenate([part.ends.reshape(n, -1, K) for part in parts], axis=1)
     return Profiles(ends, np.concatenate([part.commands_mps2.reshape(n, -1, K, B) for part in parts], axis=1))
@@ -104,8 +107,8 @@ def search_world(world: World, room: Room, starts: Profiles, last: int, budget: 
     simulate.
 
     First many profiles are improved in rounds, each of which keeps the better half. Then the phases of the best are
-    divided and it is improved again; at last with a step-by-step simulation: where harm jumps, rounding decides how
-    large it is.
+    divided, and it is improved again; finally with a step-by-step simulation, because where harm jumps, rounding
+    decides how large it is.
     """
     K, B = room.commands.shape
     M, rounds = SMALLEST_FIELD, 3
@@ -154,7 +157,10 @@ def compact(ends: Ints, commands: Floats) -> Profiles:
 
 
 def halve_phases(field: Field, attention: int) -> None:
-    """Halve phases of a field's best profile until it has K; always the longest in the first ``attention`` steps."""
+    """Halve phases of the best profile in ``field`` until it has K phases.
+
+    The next phase to halve is the longest within the first ``attention`` steps.
+    """
     phase_count, K = field.phases[0], field.ends.shape[1]
     if phase_count > 0 and field.values[0] > 0.0:
         (ends,), (commands,) = compact(field.ends[0, :phase_count], field.commands[0, :phase_count])
@@ -167,7 +173,7 @@ def halve_phases(field: Field, attention: int) -> None:
 
 
 def select(world: World, room: Room, starts: Profiles, field: Field) -> None:
-    """Put the best profile of ``field`` and ``starts`` first in ``field``; from now on simulate step by step."""
+    """Put the best profile of ``field`` and ``starts`` at index 0 of ``field``; let ``world`` simulate step by step."""
     world.numbers[STEPWISE] = 1.0
     best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
     gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
@@ -179,11 +185,11 @@ def select(world: World, room: Room, starts: Profiles, field: Field) -> None:
 def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
     """Improve one vehicle's commands at every decision; return the best, [n, T] m/s2, and their values, [n] m2/s2.
 
-    They are at least as good as the given ``commands_mps2`` [n, T]. Because small changes may miss the best commands,
-    the best of some random *templates* is improved as well: one command, another for a while, then full braking.
+    They are at least as good as ``commands_mps2`` [n, T]. Because small changes may miss the best commands, the best of
+    some random *templates* is improved as well: one command, another for a while, then full braking.
 
     Raises ``InvalidInput`` for several controlled vehicles, commands that do not fit, or a budget below 1, and
-    ``PhysicsError`` for worlds in which the given commands cannot be simulated.
+    ``PhysicsError`` for worlds in which ``commands_mps2`` cannot be simulated.
     """
     check_whole_number("budget", budget, 1)
     if len(problem.bodies) != 1:
@@ -230,6 +236,10 @@ def field_for(profiles: int, phases: int, controlled: int) -> Field:
 
 
 def prepare_world(problem: Problem, k: int, random: UInt64s, phases: int, stepwise: bool) -> tuple[World, Room]:
+    """World ``k`` of a problem for the compiled search, and the working memory for profiles of ``phases`` phases.
+
+    ``random`` [n]: states of the random number generators. ``stepwise``: simulate decision by decision.
+    """
     state = problem.state
     numbers = np.array([problem.time_step_s, problem.aim, stepwise])
     count = problem.harm_count

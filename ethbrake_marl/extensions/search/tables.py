@@ -1,4 +1,4 @@
-"""Tables of best known harm: the least known harm of each world and its profile, found by a hash of the world."""
+"""Tables of best known harm: the least known harm of each world and its profile, looked up by a hash of the world."""
 
 from __future__ import annotations
 
@@ -33,10 +33,14 @@ OF_COUNT = {"harm": ("<f8", 1), "ends": ("<u2", 2), "commands": ("<f8", 3)}  # a
 
 @dataclass(frozen=True, slots=True)
 class BestHarmTable:
+    """Least known harm of n worlds in some counts of harm, with the profiles that reach it."""
+
     identity: UInt64s  # [n] hash of each world (``pricing.identities``)
     harm: Mapping[str, Floats]  # count -> [n] m2/s2, or what else the search has minimised
     profiles: Mapping[str, Profiles]  # count -> profiles with this harm
-    header: Mapping[str, Any]  # how it was made: scenario, vehicles, physics (its digest), budget, search_seed, ...
+    header: Mapping[
+        str, Any
+    ]  # how the table was made: scenario, vehicles, physics (its digest), budget, search_seed, ...
 
     @classmethod
     def load(cls, path: Path) -> BestHarmTable:
@@ -73,15 +77,16 @@ class BestHarmTable:
         return buffer.getvalue()
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
+        """Index in this table of each world with the hashes ``identity``; -1 for a world that is not in the table."""
         order = np.argsort(self.identity, kind="stable")
         rows = order[np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)]
         return np.where(self.identity[rows] == identity, rows, -1)
 
     def stored(self, problem: Problem, count: str) -> tuple[Floats, Profiles]:
-        """Least known harm of the problem's worlds, [n] m2/s2, and its profiles, [n].
+        """Least known harm of the problem's worlds, [n] m2/s2, and the profiles that reach it, [n].
 
-        ``count``: which harm (``episode.counts``). A world that is not in the table has infinite harm and the profile
-        of coasting.
+        ``count``: count of harm (``episode.counts``). A world that is not in the table has infinite harm and a profile
+        that coasts.
         """
         rows = self.rows(problem.identity)
         in_table = rows >= 0
@@ -112,7 +117,7 @@ def shipped_tables() -> tuple[BestHarmTable, ...]:
 
 
 def outdated_tables() -> dict[str, str]:
-    """Why other shipped tables are not used: name of the scenario -> one line."""
+    """Shipped tables that are not used, scenario -> sentence with the reason, which is other physics."""
     now = physics_digest()
     physics_of_tables = {table.header["scenario"]: table.header.get("physics") for table in _load_shipped()}
     return {
@@ -124,9 +129,9 @@ def outdated_tables() -> dict[str, str]:
 
 
 def best_stored(problem: Problem, count: str) -> tuple[Floats, Profiles]:
-    """Least harm of each world in the shipped tables, [n] m2/s2, and the commands (profiles) that do it.
+    """Least harm of each world in the shipped tables, [n] m2/s2, and the profiles that reach it, [n].
 
-    ``count``: which harm (``episode.counts``). A world that is in no table has infinite harm and coasts.
+    ``count``: count of harm (``episode.counts``). A world that is in no table has infinite harm and coasts.
     """
     results = [table.stored(problem, count) for table in shipped_tables()]
     nothing = np.full(problem.n, np.inf), problem.coasting()
@@ -134,6 +139,7 @@ def best_stored(problem: Problem, count: str) -> tuple[Floats, Profiles]:
 
 
 def _unpack_arrays(data: bytes) -> dict[str, NDArray[Any]]:
+    """Arrays in the content of a file, name -> array. Raises ``ValueError`` for a damaged or too large file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(member.file_size for member in archive.infolist())
@@ -146,6 +152,7 @@ def _unpack_arrays(data: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _check(arrays: Mapping[str, NDArray[Any]], counts: list[str]) -> None:
+    """Raise ``ValueError`` unless the arrays of a table have the right names, types, shapes and values."""
     expected_arrays = ARRAYS | {f"{count}_{name}": kind for count in counts for name, kind in OF_COUNT.items()}
     for name in sorted(expected_arrays.keys() ^ arrays.keys()):
         raise ValueError(f"array {name!r}: {'is missing' if name in expected_arrays else 'must not be in this file'}")
