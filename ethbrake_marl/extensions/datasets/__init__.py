@@ -98,7 +98,7 @@ def rounded_actions(team: Team, game: Game, alert: State) -> list[Observations]:
 def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator[dict[str, Any]]:
     """Rows of the file, as columns: for each decision, name -> one value for each world whose episode has not ended.
 
-    ``actions``: actions of the L learners, one array [n, L] for each decision; learners repeat the last one.
+    ``actions``: actions of the L learners, [n, L] for each decision; learners repeat the last ones.
     """
     state, learners = game.reset(alert), game.settings.learners.tolist()
     while not state.ended.all():

@@ -63,8 +63,8 @@ def cut_chains(recording: Recording, vehicles: int) -> Chains:
 def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
     """Rows of ``states`` in which a vehicle follows another one, with two more columns: ``gap`` (m) and ``front_car``.
 
-    ``front_car`` is the row of the vehicle ahead in ``states``; if several vehicles follow the same one, only the
-    nearest is kept. Links that are left out are counted in ``left_out``, by the reason.
+    ``front_car`` is the row of the vehicle ahead. If several vehicles follow the same one, only the nearest is kept.
+    Links that are left out are counted in ``left_out``.
     """
     entry = recording.entry
     if entry.by_lane:

@@ -46,10 +46,9 @@ class Cells(NamedTuple):
         return f"{self.file}, line {line}{f', column {self.names[quantity]}' if quantity else ''}"
 
     def refuse(self, bad: Any, quantity: str, values: Any, right: str) -> None:
-        """Raise ``InvalidInput`` with file, line and column of the first value that is ``bad``, if there is one.
+        """Raise ``InvalidInput`` with file, line and column of the first bad value, if there is one.
 
-        ``bad`` and ``values``: whether a value is bad, and the values, as series with the row's number as index.
-        ``right``: what a valid value is, for the message.
+        ``bad``, ``values``: mask and values, series with the row's number as index. ``right``: what a valid value is.
         """
         if bad.any():
             row = bad.idxmax()

@@ -100,7 +100,10 @@ def moments(times_s: Floats, every_s: float) -> Floats:
 
 
 def _number_names(raw: Any, cells: Cells) -> dict[float, str]:
-    """Names of vehicles and lanes, number -> name; in ``raw`` the numbers replace the names. Refuses empty names."""
+    """Names of vehicles and lanes, number -> name; in ``raw``, the numbers replace them.
+
+    Raises ``InvalidInput`` for an empty name.
+    """
     for column in ("vehicle", "lane"):
         cells.refuse(raw[column] == "", column, raw[column], "must be a name")
     text = pd.concat([raw["vehicle"], raw["lane"]]).drop_duplicates()
@@ -129,9 +132,10 @@ def _along_road(raw: Any, cells: Cells, entry: Format) -> Any:
 
 
 def _turn_highd(states: Any, cells: Cells) -> None:
-    """Turn highD's positions and speeds into fronts and speeds that are positive in the direction of travel, in place.
+    """Turn highD's positions into fronts that grow, and speeds into positive ones, in the direction of travel; in
+    place.
 
-    In highD, a position is the left edge of a vehicle, measured to the right whichever way the vehicle drives.
+    A position in highD is the left edge of a vehicle, and grows to the right whichever way the vehicle drives.
     """
     meta = read_cells(Path(f"{str(cells.file)[:-4]}Meta.csv"), HIGHD_META).frame
     direction = states["vehicle"].map(meta.drop_duplicates("vehicle").set_index("vehicle")["direction"])

@@ -117,7 +117,7 @@ class Window(Viewer):
         """Do nothing: the window shows every step by itself."""
 
     def _play(self) -> None:
-        """Show the last time step in the window, in real time. Open a missing window; stop if the user closes it."""
+        """Show the last time step in the window, in real time. Open the window first; stop if the user closes it."""
         pygame = import_pygame()
         clock = pygame.time.Clock()
         for frame in [] if self.closed else self.step_frames():

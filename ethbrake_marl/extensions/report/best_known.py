@@ -19,7 +19,7 @@ UNAVOIDABLE = "proven_harm_impact"  # whether it is proven that no command avoid
 
 
 class BestKnown(NamedTuple):
-    """Least known harm in each of n worlds, and what is proven about contacts and impacts there."""
+    """Least known harm in each of n worlds, and what is proven about contacts and impacts."""
 
     harm: Mapping[str, Floats]  # count -> [n] m2/s2: both harms and, if it is known, the honest cost
     avoidable: Bools | None  # [n] whether contact can be avoided (proven); None: not measured
@@ -54,7 +54,7 @@ class BestKnown(NamedTuple):
 def shown_counts(compared: Compared) -> dict[str, str]:
     """Counts to show, count -> column: first-impact harm, total harm, and the count that agents minimise.
 
-    The last one is left out if the best known harm is known only for other counts.
+    The last one is left out if the best known harm is known only for others.
     """
     best_known, minimised = BestKnown.of(compared.result), compared.harm_count
     return (

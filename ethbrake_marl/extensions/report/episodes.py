@@ -105,7 +105,7 @@ def pieces_of(record: EpisodeRecord) -> Floats:
 def extrapolate(pieces: Floats, t: Floats, N: int) -> Floats:
     """Positions, gaps, speeds and accelerations ``t`` [k] seconds after the beginning of k pieces of motion, [k, 3 N].
 
-    ``pieces``: motion of N vehicles, with the columns of ``pieces_of``.
+    ``pieces``: as from ``pieces_of``, of N vehicles.
     """
     speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
     ways = (speeds + 0.5 * rates * t) * t
@@ -166,8 +166,7 @@ def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
 def worst_rows(compared: Compared, focus: str) -> Ints:
     """Rows of the worlds in which ``focus`` did worst, worst first, at most ten.
 
-    Worlds are compared by the count of harm that agents minimise or, if the best known harm is known, by the difference
-    from it. Only values above 0 are included.
+    Worst: by the count that agents minimise, minus its best known value if there is one. Only values above 0.
     """
     result, count, best_known = compared.result, compared.harm_count, BestKnown.of(compared.result)
     best = 0.0 if best_known is None else best_known.harm.get(count, 0.0)

@@ -113,8 +113,7 @@ BINS = 12  # groups of worlds with similar gaps
 def harm_by_agent(compared: Compared, tests: Mapping[str, Compared]) -> Figure:
     """Draw the mean harm of each agent as a bar with its 95 % interval.
 
-    A vertical line shows the mean best known harm. ``tests``: title of another test -> results there; marks show the
-    means of these agents in it.
+    A vertical line shows the mean best known harm. Marks show the agents' means in other ``tests``, title -> results.
     """
     count, result, best_known = compared.harm_count, compared.result, BestKnown.of(compared.result)
     agents = list(result.columns)
@@ -144,7 +143,7 @@ def harm_by_agent(compared: Compared, tests: Mapping[str, Compared]) -> Figure:
 def harm_above(compared: Compared) -> Figure:
     """Draw, for every x, the share of worlds in which an agent's regret (harm minus best known harm) is above x.
 
-    If no best known harm has been measured, the figure shows harm instead of regret. One panel for each count of harm.
+    If no best known harm has been measured, harm takes the place of regret.
     """
     result, best_known, counts = compared.result, BestKnown.of(compared.result), shown_counts(compared)
     figure, panels = new_panels((10.0, 3.8), columns=len(counts), sharey=True)
@@ -202,10 +201,9 @@ DECELERATION_POINTS = 2001  # evenly spaced decelerations
 
 
 def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float) -> Floats:
-    """Harm in one world if vehicle ``body`` holds a constant deceleration, [3, C] m2/s2.
+    """Harm in one world if vehicle ``body`` holds one of the C decelerations ``at`` (m/s2), [3, C] m2/s2.
 
-    ``at``: the C decelerations to compare (m/s2). Rows: first-impact harm as the paper's closed form predicts it, then
-    first-impact harm and total harm in a simulation until ``horizon_s``.
+    Rows: first-impact harm predicted by the paper's closed form; simulated first-impact harm; simulated total harm.
     """
     braking, wait = np.ascontiguousarray(capacities(world.car, BRAKING, world.time_s)[0]), world.car[0, LATENCY].copy()
     priced: Any = harm_of_deceleration
@@ -375,9 +373,9 @@ def write_worlds(path: Path, scenario: Scenario, episodes: int, *, seed: int, fo
 
 @in_our_style
 def worlds_figure(scenario: Scenario, drawn_worlds: DrawnWorlds, *, seed: int) -> Figure:
-    """Draw the distribution of each quantity that differs between worlds, and three of the worlds at the alert.
+    """Draw the distribution of each quantity that differs between worlds, and three worlds at the alert.
 
-    The three worlds have the smallest, the median and the largest sum of gaps.
+    These have the smallest, the median and the largest sum of gaps.
     """
     varying = _varying_quantities(drawn_worlds)
     columns = min(max(len(varying), 1), ABREAST)

@@ -37,7 +37,7 @@ def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]
     """First sentence of the page: the harm of the agent ``focus`` compared with full braking.
 
     It also names the tests in which the agent does not do less harm than full braking. ``tests``: title of another test
-    -> results of the same agents there.
+    -> its results with the same agents.
     """
     count, harm = compared.harm_count, COLUMN[compared.harm_count]
     rows, best_known = {row.agent: row for row in compared.table}, BestKnown.of(compared.result)
@@ -163,7 +163,7 @@ def measure_parts(agents: SummaryTable) -> list[Markup]:
 def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> Section:
     """Section with a table of the worlds in which ``focus`` did worst, at most ten.
 
-    ``watched``: rows of the worlds in the page's player; they get a button that shows them there.
+    ``watched``: rows of the worlds in the player; they get a button that starts it.
     """
     result, known_best, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
     counts = {**HARM, minimised: COLUMN[minimised]}

@@ -129,10 +129,9 @@ def write_figures(experiment: Experiment) -> list[Markup]:
 
 
 def telling_row(compared: Compared, learned: str) -> int:
-    """Row of a typical world for the agent ``learned``.
+    """Row of a typical world: of the worlds in which full braking does harm, the one with the median saving of harm.
 
-    Of the worlds in which full braking does harm, it is the one with the median of the harm that the agent saves. 0 if
-    there is no such world.
+    The saving is that of the agent ``learned``. Row 0 if full braking does no harm.
     """
     harm = COLUMN[compared.harm_count]
     before = compared.result[BASELINE][harm]
@@ -148,7 +147,7 @@ def report_page(
 ) -> ReportPage:
     """Page about a training run: settings, the compared agents, the paper's rows (in its own test), and other tests.
 
-    ``test_results``: name of another test -> results. ``figures``: HTML of the figures. ``learners``: tables about
+    ``test_results``: name of another test -> its results. ``figures``: HTML of the figures. ``learners``: tables about
     several learners.
     """
     trained, compared, learned = experiment.trained, experiment.compared, experiment.learned

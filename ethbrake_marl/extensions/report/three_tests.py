@@ -45,8 +45,8 @@ def title_of(name: str) -> str:
 def short_sheet(compared: Compared, test_results: Mapping[str, Compared]) -> Sheet:
     """Short table of agents: collision rate, first-impact and total harm.
 
-    If agents minimise the honest cost, also this cost and the push. ``test_results``: name of another test -> results
-    there; its means are added as further rows.
+    If agents minimise the honest cost, also this cost and the push. ``test_results``: name of another test -> its
+    results, whose means follow as further rows.
     """
     table = compared.table
     full_sheet = table.terminal()

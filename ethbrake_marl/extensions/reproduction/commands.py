@@ -77,10 +77,10 @@ def reproduce_command(
 
 
 def chosen_policies(text: str) -> dict[str, str]:
-    """Agents in the place of the paper's policies: ``PPO`` and ``SAC`` -> agent name. By default, shipped policies.
+    """Agents in the place of the paper's policies: ``PPO`` and ``SAC`` -> agent name.
 
-    ``text``: replacements, such as ``ppo=policy@RUN``. Raises ``InvalidInput`` for any other text, and for an agent
-    that cannot drive in the random test, with exact impacts and in the paper's fixed-step map.
+    ``text``: replacements of the shipped policies, such as ``ppo=policy@RUN``. Raises ``InvalidInput`` for any other
+    text, and for an agent that cannot drive in the random test.
     """
     from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS, WORLD_FIELDS, drive_all
     from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED

@@ -84,8 +84,8 @@ def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
 def show_harm(stem: str, title: str, readings: Mapping[str, Groups], legend: Sequence[str], x_label: str) -> Made:
     """Figure of mean harm, and tables: one panel and one table for each reading (interpretation of the paper's text).
 
-    ``readings``: name of the reading -> group of worlds -> harm of each strategy, and mask of the group's worlds.
-    ``legend``: strategies in the figure; tables have all. ``stem``: name of the figure's file without its ending.
+    ``readings``: name -> group of worlds -> harm of each strategy, and mask of the group's worlds. ``legend``:
+    strategies in the figure. ``stem``: name of the figure's file without its ending.
     """
     estimates = {
         reading: {

@@ -130,9 +130,9 @@ def reproduce(
 ) -> dict[Item, Made] | None:
     """Results of each item, or None if Ctrl-C stopped a training.
 
-    First trains the policies that are missing in the folder of ``settings``; then writes figures, tables and a page
-    there. ``machine``: description of the computer, for the page. Raises ``AlreadyExists`` if the folder has results
-    and ``force`` is false.
+    Trains policies that the folder of ``settings`` lacks, and writes figures, tables and a page to it. ``machine``:
+    description of the computer, for the page. Raises ``AlreadyExists`` if the folder has results and ``force`` is
+    false.
     """
     folder, results = settings.folder, {}
     check_folder(folder, (RESULTS_FILE,), force=force)

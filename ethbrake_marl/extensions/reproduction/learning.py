@@ -104,7 +104,7 @@ def _train(plan: TrainingPlan, run: Path, seed: int, settings: ReproductionSetti
 
 
 def unconverged(folder: Path) -> str:
-    """Agent name of our policy that has not converged: PPO, stopped after a fifteenth of its recipe's decisions.
+    """Agent name of our PPO policy whose training is stopped after a fifteenth of the recipe's decisions.
 
     It stands for the paper's policy "obtained from training before convergence occurred".
     """
@@ -115,7 +115,7 @@ def unconverged(folder: Path) -> str:
 def process(settings: ReproductionSettings, group: str = RANDOM) -> dict[str, list[str]]:
     """Agent names of policies trained as in the paper: ``PPO`` and ``SAC`` -> one agent name for each seed.
 
-    ``group``: group of trainings. Empty unless ``settings.full``. An algorithm with unfinished trainings is left out.
+    ``group``: group of trainings. Empty unless ``settings.full``; without algorithms that have unfinished trainings.
     """
     runs = finished_runs(settings.folder, group) if settings.full else {}
     return {

@@ -128,7 +128,7 @@ class PaperMap:
     """The paper's fixed-step map as the physics of a game (``episode.game.Physics``)."""
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse a scenario (``files.model.refuse``) with an obstacle, or with brakes that build up."""
+        """Raise an error for a scenario that has an obstacle, or brakes that build up."""
         right = "is not known to physics: paper-map; leave one of the two out"
         for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
             require(key not in scenario.sources, (key,), UNSHOWN, right)
@@ -136,8 +136,7 @@ class PaperMap:
     def rewarding(self, game: Game) -> Rewarding:
         """Rewards of the game, with the paper's r_collision as the term ``collision``.
 
-        Raises ``InvalidInput`` if they count the honest cost, or need push, driving or motion at the horizon: the map
-        has no exact impacts.
+        Raises ``InvalidInput`` for the honest cost, push, driving and motion at the horizon, which need exact impacts.
         """
         counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
         if game.settings.weights[OF_PASSED:].any() or counted:

@@ -1,7 +1,8 @@
 """The paper's random test (``Table:Random``): collision rate and mean harm of its four strategies.
 
 A *reading* is one interpretation of the paper's text: a value for each quantity that the text leaves open
-(``readings``). A simulation depends on some of these values only, so it is run once for all readings that share them.
+(``readings``). Readings that share the values on which a simulation depends are simulated once. The paper's *hybrid*
+follows a policy where its harm is at most that of E-V2X-BM, called H*, and E-V2X-BM elsewhere.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ def outcome_of(last: State) -> RandomOutcome:
 def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED_SPECS) -> RandomTable:
     """The paper's table of the random test under one interpretation (``reading``) of its text, with 95 % intervals.
 
-    ``policies``: ``SAC`` and ``PPO`` -> agent name. Raises ``InvalidInput`` if the reading combines the H* of E-V2X-BM
-    (coupled), which needs exact impacts, with the paper's fixed-step map.
+    ``policies``: ``SAC`` and ``PPO`` -> agent name. Raises ``InvalidInput`` if the reading needs E-V2X-BM (coupled),
+    which needs exact impacts, in the paper's fixed-step map.
     """
     specs = "", "", policies["SAC"], policies["PPO"]
     outcomes = {row: report_outcome(row, reading, episodes, spec) for row, spec in zip(PAPER_ROWS, specs, strict=True)}
@@ -98,8 +99,8 @@ def report_outcome(row: str, reading: Reading, episodes: int, spec: str = "") ->
 def algorithm_1(policy: RandomOutcome, baseline: RandomOutcome, bound: Floats, counted: str = "first") -> RandomOutcome:
     """Outcome of the paper's hybrid: the policy's where its harm is at most ``bound``, elsewhere that of E-V2X-BM.
 
-    ``policy``, ``baseline``: outcomes of the policy and of E-V2X-BM. ``bound``: H* [n] (m2/s2). ``counted``: the harm
-    to compare, ``first`` or ``total``.
+    ``policy``, ``baseline``: outcomes of the policy and of E-V2X-BM. ``bound``: harm of E-V2X-BM, predicted or
+    simulated, [n] m2/s2. ``counted``: the harm to compare, ``first`` or ``total``.
     """
     follows = policy[counted] <= bound
     return {key: np.where(follows, policy[key], baseline[key]) for key in policy}
@@ -109,7 +110,7 @@ def reported_values(numbers: str, collided: Bools, harm: Floats, predicted: Floa
     """Collisions and harm (m2/s2) to report, [n] each: as simulated, or as predicted at the alert.
 
     ``numbers``: ``realised`` (simulated), ``predicted``, or ``predicted harm, realised collisions``. ``collided``,
-    ``harm``: as simulated. ``predicted``: predicted harm; a predicted collision is a predicted harm above 0.
+    ``harm``: simulated. ``predicted``: predicted harm.
     """
     if numbers == "predicted":
         return predicted > 0.0, predicted

@@ -36,8 +36,8 @@ MAP_STEP_S = 0.1
 def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, RandomOutcome]:
     """Outcome of each strategy under one interpretation (``reading``) of the paper's text: name -> outcome.
 
-    ``policies``: name -> agent name; a hybrid of each is included, which decides by first-impact harm. If impacts are
-    exact, E-V2X-BM (coupled), and hybrids with its H*, are included as well.
+    ``policies``: name -> agent name. Every policy also has a hybrid (``algorithm_1``), which compares first-impact
+    harm. If impacts are exact, E-V2X-BM (coupled) and its hybrids are included.
     """
     worlds, plans = reading.only(*WORLD_FIELDS), reading.only(*PLANS)
     baseline = {**brake(worlds, plans, "brakes on", episodes), PREDICTED: plan(plans, episodes).harm}

@@ -79,9 +79,9 @@ def number_claims(
 ) -> list[Claim]:
     """Verdict on every number that the paper prints in a table.
 
-    ``where``: ``Table II`` or ``Table III``. ``stated``, ``nearest``: our outcomes with the paper's parameters as
-    stated, and under the interpretation of the paper whose results come nearest to the printed ones. ``least``: proven
-    lower bound on the harm with the parameters as stated, [n] m2/s2. ``not_ours``: the policies are the user's.
+    ``stated``, ``nearest``: our outcomes with the paper's parameters as stated, and under the interpretation of the
+    paper whose results come nearest to the printed ones. ``least``: proven lower bound on the harm with the parameters
+    as stated, [n] m2/s2. ``not_ours``: the policies are the user's.
     """
     claims, proven = [], {RATE: rate(least > 0.0), AVERAGE: mean(least)}
     for row in printed:

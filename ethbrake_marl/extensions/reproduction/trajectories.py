@@ -41,8 +41,7 @@ def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Recor
 def road_figure(records: Records, caption: str) -> Figure:
     """Draw the positions of the vehicles along the road in four episodes, one panel each, with an arrow every second.
 
-    A panel has a row for each vehicle; dashed lines join the vehicles at the same time. ``records``: (policy, scenario
-    number) -> episode.
+    Dashed lines join the vehicles at the same time. ``records``: (policy, scenario number) -> episode.
     """
     figure, panels = new_panels((10.0, 4.8), 2, 2, sharex=True, sharey=True)
     for axes, ((name, number), record) in zip(panels, records.items(), strict=True):
@@ -197,8 +196,7 @@ def policy_difference(records: Records, number: int, what: str) -> float:
 def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[Claim]:
     """Verdicts on claims that one quantity is smaller than another in a single world.
 
-    ``where``: figure of the paper. ``readings``: first with the parameters as stated, then in the nearest reading,
-    claim -> the numbers in words, and the smaller quantity minus the larger one.
+    ``readings``: as stated, then in the nearest reading: claim -> numbers in words, smaller quantity minus larger one.
     """
     claims = []
     for text in readings[0]:

@@ -65,7 +65,7 @@ class WeaknessMeasure(NamedTuple):
     def __call__(self, worlds: State) -> WeaknessResult:
         """Value of the measure in every world.
 
-        Raises ``InvalidInput`` for ``bound`` if the agent has no shield that promises a bound at the alert.
+        Raises ``InvalidInput`` for ``bound`` if the agent has no shield that promises a bound.
         """
         last, *rival_states = (play_to_end(self.game, worlds, team) for team in self.teams)
         harm = last.harm(self.harm_count)
