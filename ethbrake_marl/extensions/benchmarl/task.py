@@ -1,7 +1,7 @@
 """A scenario as a TorchRL environment and as a BenchMARL task; needs ``pip install ethbrake-marl[marl]``.
 
-All learners of a world form one group in TorchRL, and its episode ends for all of them at once. ``state``, the input of
-a central critic, is the full state of the line (``episode.full_state``).
+In TorchRL all learners of a world form one group, and the episode of a world ends for all of them at once. ``state``,
+the input of a central critic, is the full state of the line (``episode.full_state``).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
     discrete actions [n, L]), reward [n, L, 1], state [n, S], done [n, 1].
 
     Args:
-        scenario: must have a learner; all learners observe the same features.
+        scenario: must have a learner; all its learners must observe the same features.
         n: number of worlds.
         seed: seed of the worlds.
         reward: a name such as ``harm``, or the weights of the reward's terms.
@@ -94,7 +94,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         self.done_spec = Composite(flag, shape=(n,))
 
     def _reset(self, tensordict: Any, **settings: Any) -> Any:
-        """Start new episodes in all worlds or, if ``tensordict`` has a mask ``_reset``, where it is True."""
+        """Start new episodes: in all worlds or, if ``tensordict`` has a mask ``_reset``, where the mask is True."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = np.arange(self.batch_size[0]) if mask is None else np.flatnonzero(mask.numpy().reshape(-1))
         stream, new = self.stream.next_episodes(rows)
@@ -104,6 +104,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         return TensorDict(content, batch_size=self.batch_size)
 
     def _step(self, tensordict: Any) -> Any:
+        """Advance all worlds by one step; return observations, state, rewards, and whether episodes have ended."""
         shape = self.batch_size[0], len(self.learners)
         actions = checked_actions(tensordict[GROUP, "action"].numpy(), shape, "the learners", self.actions)
         state, step = self.game.step(self.episode, actions)
@@ -118,7 +119,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         return TensorDict(content, batch_size=self.batch_size)
 
     def render(self, mode: str = "rgb_array") -> Any:
-        """Picture of the first world in the form that the render mode defines."""
+        """Picture of the first world, or what another render mode shows. Only the ``mode`` of the first call counts."""
         if self.renderer is None:
             self.renderer = make_renderer(self, mode)
             self.renderer.began(self.episode.take([0]))
@@ -137,20 +138,23 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
 
 
 class LineTask(TaskClass):  # type: ignore[misc]
-    """BenchMARL task of one scenario. ``config`` has the arguments of ``LineEnv``; only ``scenario`` is required."""
+    """BenchMARL task of one scenario.
+
+    ``config``: arguments of ``LineEnv`` except ``n`` and ``seed``; only ``scenario`` is required.
+    """
 
     def __init__(self, name: str, config: dict[str, Any]) -> None:
         super().__init__(name, {**config, "scenario": load_scenario(config["scenario"])})
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario of ``config``, which may be changed to another one, its name, or the path of its file."""
+        """Scenario in ``config``, where it may be replaced by another scenario, its name, or the path of its file."""
         return load_scenario(self.config["scenario"])
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
         """Function that creates a ``LineEnv``. ``device`` is unused.
 
-        Raises ``InvalidInput`` if task and BenchMARL do not agree on continuous or discrete actions.
+        Raises ``InvalidInput`` if ``continuous_actions`` contradicts ``actions`` in the task's ``config``.
         """
         actions = self.config.get("actions")
         if continuous_actions != (actions is None):

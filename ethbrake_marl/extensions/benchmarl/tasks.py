@@ -51,7 +51,7 @@ EthBrakeTask = _Scenarios("EthBrakeTask", list(TASK_SCENARIOS))
 
 
 def register_tasks() -> None:
-    """Register the tasks in BenchMARL as ``ethbrake/paper_random`` and so on; repeated calls are harmless."""
+    """Register the tasks in BenchMARL, with names such as ``ethbrake/paper_random``; repeated calls are harmless."""
     store = ConfigStore.instance()
     for task in EthBrakeTask:
         name = task.name.lower()

@@ -1,8 +1,8 @@
 """Write the episodes of agents to a Parquet file: observation, action and reward of every decision.
 
-An agent's command is a float64 number in m/s2, and a learner's action a float32 number in [-1, 1]. So each world is
+An agent's command is a float64 number in m/s2, but a learner's action is a float32 number in [-1, 1]. So each world is
 simulated twice: first the agent drives, and its commands are rounded to actions; then learners take these actions. The
-file contains the second episode, which an environment repeats bit for bit from the recorded actions.
+file contains the second episode. An environment that gets the recorded actions repeats it bit for bit.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ def to_parquet(
 ) -> None:
     """Let agents drive, and write a Parquet file with one row for each agent, world and decision.
 
-    Each of the ``agents`` drives all learners, in the worlds 0 to ``episodes`` - 1 of ``seed``. ``reward``: a name such
-    as ``harm``, or the weights of its terms. docs/extensions/datasets.md describes the file.
+    Every agent of ``agents`` controls all learners, in the worlds 0 to ``episodes`` - 1 of ``seed``. ``reward``: a name
+    such as ``harm``, or the weights of the reward's terms. docs/extensions/datasets.md describes the file.
 
     Raises ``InvalidInput`` for an invalid argument, ``AlreadyExists`` if the file exists and ``force`` is false, and
-    ``MissingExtra`` without pyarrow.
+    ``MissingExtra`` if pyarrow is not installed.
     """
     loaded, game = open_game(scenario, reward=reward)
     if not loaded.learners:
@@ -86,7 +86,7 @@ def to_parquet(
 
 
 def rounded_actions(team: Team, game: Game, alert: State) -> list[Observations]:
-    """Simulate a team in n worlds; return its L learners' commands as actions, one array [n, L] for each decision."""
+    """Commands of a team that drives n worlds, as float32 actions of the L learners, [n, L] for each decision."""
     learners = game.settings.learners
     return [
         actions_of(state, learners, state.wanted[:, learners]).astype(np.float32)
@@ -96,9 +96,9 @@ def rounded_actions(team: Team, game: Game, alert: State) -> list[Observations]:
 
 
 def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator[dict[str, Any]]:
-    """Columns of each decision, with one value for each world whose episode has not ended.
+    """Rows of the file, as columns: for each decision, name -> one value for each world whose episode has not ended.
 
-    The learners take ``actions``; after the last of these they repeat it.
+    ``actions``: actions of the L learners, [n, L] for each decision; learners repeat the last ones.
     """
     state, learners = game.reset(alert), game.settings.learners.tolist()
     while not state.ended.all():

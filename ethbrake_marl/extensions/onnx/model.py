@@ -14,11 +14,11 @@ CAPACITIES = ("own.braking_capacity", "own.driving_capacity")
 
 
 def to_onnx(policy: Policy) -> bytes:
-    """ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
+    """ONNX model as bytes: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
     The acceleration is the action times the observed braking or driving capacity. Results may differ from this
-    package's by rounding. Its metadata list the names of the observed ``features``. Raises ``InvalidInput`` if the
-    policy does not observe both its capacities, ``MissingExtra`` without the package onnx.
+    package's by rounding. The model's metadata list the names of the observed features. Raises ``InvalidInput`` if the
+    policy does not observe both capacities of its vehicle, and ``MissingExtra`` if the package onnx is not installed.
     """
     manifest, observation, tensors = policy.manifest, policy.observation, policy.tensors
     spec, columns = manifest.network, {f.name: (c, f.scale) for c, f in enumerate(observation.features)}

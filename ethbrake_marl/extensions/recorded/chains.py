@@ -1,7 +1,7 @@
 """Form chains of vehicles that follow each other.
 
-A *queue* is a sequence of vehicles, each of which follows the next, at one moment of a recording. It is cut into
-*chains* of a fixed number of vehicles. Each chain is one row of gaps and speeds.
+A *queue* is a sequence of vehicles, each of which follows the next, at one moment of a recording. A queue is cut into
+*chains* of a fixed number of vehicles. The gaps and speeds in a chain become one row of a scenario's table.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Chains(NamedTuple):
 def cut_chains(recording: Recording, vehicles: int) -> Chains:
     """Chains of ``vehicles`` vehicles in a recording, ordered by time and by the queue's front vehicle.
 
-    The first chain of a queue begins with its front vehicle, the next one directly behind it, and so on. Raises
-    ``InvalidInput`` if too many vehicles have faulty data.
+    The first chain of a queue begins with the front vehicle of the queue, and every later chain directly behind the
+    chain before. Raises ``InvalidInput`` if too many vehicles have faulty data.
     """
     left_out = Counter[str]()
     states = recording.states[~recording.states.duplicated(["moment", "vehicle"])].reset_index(drop=True)
@@ -61,10 +61,10 @@ def cut_chains(recording: Recording, vehicles: int) -> Chains:
 
 
 def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
-    """Rows of ``states`` of vehicles that follow another one, with ``gap`` (m) and ``front_car``.
+    """Rows of ``states`` in which a vehicle follows another one, with two more columns: ``gap`` (m) and ``front_car``.
 
-    ``front_car`` is the row of the vehicle ahead; each vehicle occurs once per moment. ``left_out`` counts what is left
-    out.
+    ``front_car`` is the row of the vehicle ahead. If several vehicles follow the same one, only the nearest is kept.
+    Links that are left out are counted in ``left_out``.
     """
     entry = recording.entry
     if entry.by_lane:
@@ -94,6 +94,10 @@ def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
 
 
 def _check_faults(recording: Recording, faulty: Any, left_out: Counter[str]) -> None:
+    """Count faulty data in ``left_out``, or raise ``InvalidInput`` if their share exceeds the format's limit.
+
+    ``faulty``: rows of vehicles that overlap the vehicle ahead, or whose vehicle ahead is not recorded.
+    """
     states = recording.states
     twice = states[states.duplicated(["moment", "vehicle"])]
     number = len(faulty) + len(twice)

@@ -38,12 +38,12 @@ class Format(NamedTuple):
 
     @property
     def gaps(self) -> bool:
-        """Whether files contain gaps, empty if not measured, instead of positions and lengths."""
+        """Whether files contain gaps (empty where not measured) instead of positions and lengths."""
         return "gap" in self.columns
 
     @property
     def by_lane(self) -> bool:
-        """Whether lanes and positions must determine the vehicle ahead, because no column contains its id."""
+        """Whether the vehicle ahead must be determined from lanes and positions, because no column contains its id."""
         return "ahead" not in self.columns and not self.gaps
 
 
@@ -91,12 +91,12 @@ _ROLES = ("time", "vehicle", "lane", "front", "length", "speed")  # keys of ``--
 
 
 def format_of(name: DataFormat, columns: str = "") -> Format:
-    """Format of recorded traffic with this name.
+    """Format of recorded traffic called ``name``.
 
-    ``columns`` is for the format ``table`` only: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. All
-    values except ``units`` are names of columns. ``time=t/1000``: the column ``t`` has times in 1/1000 s. ``units``:
-    ``m`` (m and m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h). Raises ``InvalidInput`` for missing, repeated or
-    unknown keys, and unknown units.
+    ``columns`` describes the format ``table``: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. All
+    values except that of ``units`` are names of columns. ``time=t/1000`` means that the column ``t`` is in 1/1000 s.
+    ``units`` is ``m`` (m and m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h). Raises ``InvalidInput`` for missing,
+    repeated or unknown keys, for unknown units, and for ``columns`` with any other format.
     """
     if name != "table":
         if columns:

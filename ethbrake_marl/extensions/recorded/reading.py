@@ -25,11 +25,14 @@ OTHER_NAMES = {"preceeding": "preceding"}  # misspelt column in some files of NG
 
 
 class NotARecording(InvalidInput):
-    """The file lacks more than half of the format's columns."""
+    """A file lacks more than half of the columns of its format."""
 
 
 class Cells(NamedTuple):
-    """The columns of a format in a file. The index of ``frame`` is the row's number, from 0."""
+    """Columns of a recorded file that its format uses.
+
+    The index of ``frame`` is the number of the row in the file, from 0.
+    """
 
     file: Path
     names: Mapping[str, str]  # quantity -> name of its column; for numbered columns ``speed1``, ``speed2``, ...
@@ -43,9 +46,9 @@ class Cells(NamedTuple):
         return f"{self.file}, line {line}{f', column {self.names[quantity]}' if quantity else ''}"
 
     def refuse(self, bad: Any, quantity: str, values: Any, right: str) -> None:
-        """Raise ``InvalidInput``, with file, line and column, at the first value that is ``bad``.
+        """Raise ``InvalidInput`` with file, line and column of the first bad value, if there is one.
 
-        ``bad`` and ``values`` are series with the row's number as index; ``right`` says what a valid value is.
+        ``bad``, ``values``: mask and values, series with the row's number as index. ``right``: what a valid value is.
         """
         if bad.any():
             row = bad.idxmax()
@@ -54,7 +57,7 @@ class Cells(NamedTuple):
 
 @contextmanager
 def reading(file: Path) -> Iterator[BufferedReader]:
-    """Open a file. Bytes that are no text, and errors of pyarrow, become ``InvalidInput``."""
+    """Context manager that opens a file. Errors of pyarrow, and bytes that are no text, become ``InvalidInput``."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             yield stream
@@ -64,13 +67,15 @@ def reading(file: Path) -> Iterator[BufferedReader]:
 
 
 def read_cells(file: Path, entry: Format) -> Cells:
-    """Columns of a format in a file; lines before the header are ignored.
+    """Columns of a recorded file that its format ``entry`` uses; lines before the header are ignored.
 
-    Raises ``InvalidInput``, which names file, line and column, if a column is missing or occurs twice, and for a cell
-    that is empty or not a number; ``NotARecording`` if more than half of the columns are missing.
+    Rows whose Location is one of ``entry.streets`` are left out. Raises ``InvalidInput``, with file, line and column,
+    if a column is missing or occurs twice, and for a cell that is empty or not a number; ``NotARecording`` if more than
+    half of the columns are missing.
     """
     with reading(file) as stream:
         heading, separator, names, at = _header(file, entry, stream)
+        # Columns are named by their places, because the names in a header may occur twice.
         column_numbers = [str(k) for k in at.values()]
         table = csv.read_csv(
             stream,
@@ -93,6 +98,11 @@ def read_cells(file: Path, entry: Format) -> Cells:
 
 
 def _header(file: Path, entry: Format, stream: BufferedReader) -> tuple[int, str, Sequence[str], dict[str, int]]:
+    """Line number of the header (from 1), separator, names of all columns, and quantity -> place of its column.
+
+    Places count from 0. The header is the first line that has all columns of the format. Without such a line, raises
+    ``NotARecording`` if the best line lacks more than half of the columns, else ``InvalidInput``.
+    """
     missing = list(entry.columns.values())
     for number in range(1, HEADER_LINES + 1):
         line = stream.readline(LONGEST_HEAD).decode("utf-8-sig")
@@ -107,6 +117,10 @@ def _header(file: Path, entry: Format, stream: BufferedReader) -> tuple[int, str
 
 
 def _match(file: Path, entry: Format, names: Sequence[str]) -> tuple[dict[str, int], list[str]]:
+    """Quantity -> place of its column in ``names`` (from 0), and the format's columns that ``names`` lacks.
+
+    Raises ``InvalidInput`` if no column is missing and one occurs twice.
+    """
     at, missing, twice = dict[str, int](), list[str](), list[str]()
     for quantity, column in entry.columns.items():
         pattern = re.escape(column.lower()).replace(re.escape(VEHICLE_PLACEHOLDER), "([1-9][0-9]*)")
@@ -125,6 +139,10 @@ def _match(file: Path, entry: Format, names: Sequence[str]) -> tuple[dict[str, i
 
 
 def _numbers(cells: Cells, quantity: str, column: Any, may_be_empty: bool) -> Any:
+    """Cells of a column as numbers; commas may group thousands. Empty cells become NaN if they are allowed.
+
+    Raises ``InvalidInput`` with file, line and column of the first cell that is not a finite number.
+    """
     try:
         values = column.cast(pyarrow.float64()).to_numpy()
     except pyarrow.ArrowException:

@@ -81,20 +81,20 @@ def scenario_from_data(
 ) -> FromData:
     """Create a scenario from the recordings in a folder and its subfolders; each world is a recorded chain of vehicles.
 
-    At regular times, each queue of vehicles in a recording is cut into chains of as many vehicles as the scenario
-    ``based_on`` has, beginning at the front of the queue. Each chain is one row of gaps and speeds. If there are more
-    rows than the table of a scenario may have, only every k-th row is used.
+    At regular times, each queue (vehicles that follow each other) is cut, from its front vehicle on, into chains of as
+    many vehicles as the scenario ``based_on`` has. The gaps and speeds of a chain are one row. If there are more rows
+    than a scenario's table may have, only every k-th row is used.
 
     Args:
         name: name of the scenario.
         folder: folder with the files, or one file.
         format: format of the files.
-        columns: for the format ``table`` only (``format_of``).
+        columns: which column has which role, for the format ``table`` only (``format_of``).
         based_on: scenario that provides the number of vehicles and all quantities that are not recorded.
         every_s: time between two moments at which chains are formed, s.
-        progress: called with ``files``, the number of files read so far, and the number of all files.
+        progress: called with the word ``files``, the number of files read so far, and the number of all files.
 
-    Raises ``InvalidInput``, which names file, line and column, if no file can be used.
+    Raises ``InvalidInput`` for an invalid argument and, with file, line and column, if no file can be used.
 
     """
     entry, base = format_of(format, columns), load_scenario(based_on)
@@ -135,10 +135,10 @@ def scenario_from_data(
 def read_chains(
     folder: Path, entry: Format, every_s: float, vehicles: int, progress: Callable[[str, int, int], None]
 ) -> ChainRows:
-    """Read the chains of vehicles in all recordings of a folder and its subfolders, or in one file.
+    """Chains of ``vehicles`` vehicles in all recordings of a folder and its subfolders, or in one file.
 
-    A file with an error is refused completely. A file with the same content as another one is skipped. Raises
-    ``InvalidInput`` if there is no recording of this format, or no row.
+    Chains are formed every ``every_s`` seconds. A file with an error is refused as a whole; a copy of another file is
+    skipped. Raises ``InvalidInput`` if there is no recording of the format ``entry``, or no chain.
     """
     longest, left_out, refused, skipped = 0, Counter[str](), list[str](), list[str]()
     numbers, of, digests, format_errors = (
@@ -193,10 +193,10 @@ def read_chains(
 
 
 def files_of(folder: Path, entry: Format, refused: list[str]) -> dict[str, Path]:
-    """Files of a format in a folder and its subfolders, or the one file: printable name -> path.
+    """Files in a folder and its subfolders whose names fit a format: printable name -> path.
 
-    Errors for subfolders that cannot be read are added to ``refused``. Names that begin with a dot, and links to
-    folders, are ignored.
+    ``folder`` may be one file, with any name. A subfolder that cannot be read adds an error message to ``refused``.
+    Names that begin with a dot, and links to folders, are ignored.
     """
     if not folder.is_dir():
         return {plain_text(folder.name): folder} if folder.is_file() else {}

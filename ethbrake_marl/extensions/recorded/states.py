@@ -27,12 +27,13 @@ SLOPE, LEAST_M2 = (0.5, 2.0), 100.0
 
 
 class Recording(NamedTuple):
-    """The states of the vehicles of one file at regular moments.
+    """States of the vehicles of one file at regular moments.
 
-    ``states`` has one row per vehicle and moment, sorted by ``moment`` (its number, from 0) and ``vehicle``. ``ahead``
-    is the vehicle ahead, negative if there is none. ``front`` and ``side`` are x and y of its front (m), ``dx`` and
-    ``dy`` its direction of travel (1 and 0 if positions are along the road). ``length`` (m) is 0 if the data contain
-    gaps. ``speed`` is in m/s, ``row`` the row in the file.
+    ``states`` has one row for each vehicle and moment, sorted by ``moment`` (its number, from 0) and ``vehicle`` (its
+    number). Further columns: ``lane``; ``ahead``, number of the vehicle ahead, negative if there is none; ``front`` and
+    ``side``, x and y of the vehicle's front (m); ``dx`` and ``dy``, unit vector of its direction of travel (1 and 0 if
+    positions are along the road); ``length`` (m), 0 if the data contain gaps; ``speed`` (m/s); ``row``, number of the
+    row in the file.
     """
 
     cells: Cells
@@ -45,9 +46,9 @@ class Recording(NamedTuple):
 
 
 def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
-    """Read the states of the vehicles in a file every ``every_s`` seconds, from the file's first moment on.
+    """States of the vehicles in a file every ``every_s`` seconds, from the file's first moment on.
 
-    Raises ``InvalidInput``, which names file, line and column, for an impossible value such as a length of 0 m, and if
+    Raises ``InvalidInput``, with file, line and column, for an impossible value such as a length of 0 m, and if
     positions contradict the speeds.
     """
     cells, names = read_cells(file, entry), dict[float, str]()
@@ -76,10 +77,10 @@ def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
 
 
 def moments(times_s: Floats, every_s: float) -> Floats:
-    """Thin recorded times out to one every ``every_s``: return k of each kept time, -1 of the others (as floats).
+    """For each recorded time, the number k of the moment for which it is used, or -1: it is left out; [rows] floats.
 
-    Kept as k is the recorded time nearest to ``min(times_s) + k every_s``, if it is at most half the smallest step
-    between recorded times away. Raises ``InvalidInput`` if ``every_s`` is less than that step.
+    Moment k is ``min(times_s) + k every_s``. The nearest recorded time is used for it, if it is at most half the
+    smallest step between recorded times away. Raises ``InvalidInput`` if ``every_s`` is less than that step.
     """
     recorded, back = np.unique(np.round(times_s - times_s.min(), 6), return_inverse=True)
     step = np.diff(recorded).min(initial=every_s if len(recorded) == 1 else np.inf)
@@ -99,6 +100,10 @@ def moments(times_s: Floats, every_s: float) -> Floats:
 
 
 def _number_names(raw: Any, cells: Cells) -> dict[float, str]:
+    """Names of vehicles and lanes, number -> name; in ``raw``, the numbers replace them.
+
+    Raises ``InvalidInput`` for an empty name.
+    """
     for column in ("vehicle", "lane"):
         cells.refuse(raw[column] == "", column, raw[column], "must be a name")
     text = pd.concat([raw["vehicle"], raw["lane"]]).drop_duplicates()
@@ -127,7 +132,11 @@ def _along_road(raw: Any, cells: Cells, entry: Format) -> Any:
 
 
 def _turn_highd(states: Any, cells: Cells) -> None:
-    """Turn highD's positions (left edges, growing to the right) into fronts that grow in the direction of travel."""
+    """Turn highD's positions into fronts that grow, and speeds into positive ones, in the direction of travel; in
+    place.
+
+    A position in highD is the left edge of a vehicle, and grows to the right whichever way the vehicle drives.
+    """
     meta = read_cells(Path(f"{str(cells.file)[:-4]}Meta.csv"), HIGHD_META).frame
     direction = states["vehicle"].map(meta.drop_duplicates("vehicle").set_index("vehicle")["direction"])
     right = "must have the drivingDirection 1 or 2 in its tracksMeta.csv"
@@ -145,6 +154,7 @@ def _turn_exid(states: Any, raw: Any) -> None:
 
 
 def _check(states: Any, cells: Cells, entry: Format) -> None:
+    """Raise ``InvalidInput`` for an impossible length or speed, and if too few vehicles are as long as cars."""
     length, speed = states["length"], states["speed"]
     right = f"m: the length must be above 0 and at most {LONGEST_M:g} m; {entry.title} is in {entry.units}"
     cells.refuse((length <= 0.0) | (length > LONGEST_M), "length", length, right)
@@ -159,6 +169,10 @@ def _check(states: Any, cells: Cells, entry: Format) -> None:
 
 
 def _check_positions(recording: Recording, every_s: float) -> None:
+    """Raise ``InvalidInput`` if, in some lane, positions change much more or less than speeds imply, or backwards.
+
+    ``every_s``: time between two moments of the recording (s).
+    """
     cells, entry, now = recording.cells, recording.entry, recording.states
     then = now[["moment", "vehicle", "lane", "front", "side", "speed"]].assign(moment=now["moment"] + 1.0)
     pairs = now.merge(then, on=["moment", "vehicle", "lane"], suffixes=("", "_then"))
@@ -176,10 +190,10 @@ def _check_positions(recording: Recording, every_s: float) -> None:
 
 
 def _openacc(raw: Any, cells: Cells, entry: Format) -> Any:
-    """States of cars whose speeds and gaps were recorded, in numbered columns.
+    """States of cars whose speeds and gaps were recorded in numbered columns.
 
     Car k + 1 follows car k if the speeds of both cars and the gap between them (column ``IVS`` with the number k) are
-    recorded. The first car of a queue has position 0, every other car minus the sum of the gaps up to the first.
+    recorded. The position of a car is minus the sum of the recorded gaps ahead of it.
     """
     cars = sorted(int(name.removeprefix("speed")) for name in raw if name.startswith("speed"))
     gap_of = {k: f"gap{k - 1}" for k in cars if k - 1 in cars and f"gap{k - 1}" in raw}

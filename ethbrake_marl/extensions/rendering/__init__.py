@@ -1,1 +1,1 @@
-"""Pictures, words and a window of running episodes."""
+"""Show running episodes as pictures, as text, or in a window."""

@@ -24,7 +24,7 @@ ROAD = 160  # height (pixels) of title, gaps and road, the upper part of a pictu
 
 
 def film_scenes(world: State, team: Team, game: Game) -> list[Scene]:
-    """25 scenes per second from the alert on, and the last one."""
+    """Scenes of one world that a team drives: 25 per second from the alert on, and the end of the episode."""
     motion, scenes = Motion(game, world, 0), list[Scene]()
     for _, state in play(game, world, team):
         motion.step(state)
@@ -35,11 +35,11 @@ def film_scenes(world: State, team: Team, game: Game) -> list[Scene]:
 
 
 def film(world: State, teams: Mapping[str, Team], ending: str, game: Game) -> bytes:
-    """Let teams drive the same world; return their films, one below the other, as the content of one file.
+    """Films of teams that drive the same world, one below the other, as the content of one file.
 
-    The keys of ``teams`` are the titles. A film that ends early shows its last scene until the end. ``ending``:
-    ``.gif`` or ``.mp4``, or ``.png`` for three moments: the alert, the hardest impact under any team, and the end.
-    Raises the errors of ``check_film``.
+    ``teams``: title -> team. A film that ends early shows its last scene until all have ended. ``ending``: ``.gif`` or
+    ``.mp4``; or ``.png`` for stills of three moments: the alert, the hardest impact under any team, and the end. Raises
+    ``InvalidInput`` for any other ending, and ``MissingExtra`` for ``.mp4`` if imageio-ffmpeg is not installed.
     """
     check_film(ending)
     films = {title: film_scenes(world, team, game) for title, team in teams.items()}
@@ -47,7 +47,10 @@ def film(world: State, teams: Mapping[str, Team], ending: str, game: Game) -> by
 
 
 def check_film(ending: str) -> None:
-    """Raise ``InvalidInput`` for another file ending, and ``MissingExtra`` for .mp4 without imageio-ffmpeg."""
+    """Raise ``InvalidInput`` for a file ending other than .gif, .mp4 and .png.
+
+    Raise ``MissingExtra`` for .mp4 if imageio-ffmpeg is not installed.
+    """
     if ending not in WRITERS:
         raise InvalidInput(f"film with the file ending {ending!r}: the ending must be one of {', '.join(WRITERS)}")
     if ending == ".mp4":
@@ -75,6 +78,7 @@ def write_gif(films: Films) -> bytes:
 
 
 def write_mp4(films: Films) -> bytes:
+    """Content of an MP4 file with the films, one below the other."""
     from imageio_ffmpeg import write_frames
 
     with TemporaryDirectory() as folder:
@@ -88,6 +92,7 @@ def write_mp4(films: Films) -> bytes:
 
 
 def write_png(films: Films) -> bytes:
+    """Content of a PNG file: for each film, the alert, the hardest impact under any team, and the end."""
     from PIL import Image
 
     numbered = [(k, scene) for scenes in films.values() for k, scene in enumerate(scenes)]

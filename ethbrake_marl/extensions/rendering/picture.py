@@ -47,11 +47,13 @@ def text_width(words: str, size: int) -> float:
 
 
 def fitting(choices: Sequence[str], width: float, size: int) -> str:
-    """First text that is at most ``width`` pixels wide, or else the last one."""
+    """First of the texts ``choices`` that is at most ``width`` pixels wide in the font size ``size``, else the last."""
     return next((words for words in choices if text_width(words, size) <= width), choices[-1])
 
 
 class Pen:
+    """Tool that draws one scene. Coordinates are in pixels of the finished picture; places on the road are in m."""
+
     def __init__(self, scene: Scene) -> None:
         self.scene, self.fronts_m, (self.left_m, self.right_m) = scene, scene.fronts_m, scene.shown_m
         self.image = Image.new("RGB", (WIDTH * FINE, HEIGHT * FINE), PAPER)
@@ -87,7 +89,7 @@ class Pen:
 
 
 def picture(scene: Scene) -> Frame:
-    """Scene as a picture, [304, 800, 3] uint8."""
+    """Picture of a scene, [304, 800, 3] uint8."""
     pen = Pen(scene)
     draw_road(pen)
     for body in range(1, len(scene.wanted)):
@@ -104,6 +106,7 @@ def picture(scene: Scene) -> Frame:
 
 
 def draw_road(pen: Pen) -> None:
+    """Draw the road with distances (m), and the obstacle."""
     pen.box(0, ROAD_TOP, WIDTH, ROAD_BOTTOM, ASPHALT)
     for place_m in pen.marks(5.0):
         for y in (ROAD_TOP + 5, ROAD_BOTTOM - 5):
@@ -120,6 +123,7 @@ def draw_road(pen: Pen) -> None:
 
 
 def draw_vehicle(pen: Pen, body: int) -> None:
+    """Draw a vehicle on the road, with red lights while it brakes, and a triangle above it if it is a learner."""
     left, right = pen.ends(body)
     pen.box(left, LANE - BODY, right, LANE + BODY, vehicle_colour(body))
     glass = left + (right - left) * 0.72
@@ -134,7 +138,7 @@ def draw_vehicle(pen: Pen, body: int) -> None:
 
 
 def draw_panel(pen: Pen, body: int) -> None:
-    """Draw a vehicle's speed and command. The command's bar extends left for braking and right for driving."""
+    """Draw a vehicle's speed, and its command as a bar that extends left for braking and right for driving."""
     scene, count = pen.scene, len(pen.scene.wanted) - 1
     gap = 24.0 if count <= 5 else 10.0
     width = min((WIDTH - 2 * MARGIN - gap * (count - 1)) / count, 240.0)
@@ -156,7 +160,7 @@ def draw_panel(pen: Pen, body: int) -> None:
 
 
 def write_gaps(pen: Pen) -> None:
-    """Write every gap above the road; a text without enough space is written a line higher."""
+    """Write every gap (m) above the road, one line higher where two texts would overlap."""
     free = math.inf
     for pair in range(0 if pen.scene.has_obstacle else 1, len(pen.scene.wanted) - 1):
         left, right = pen.ends(pair + 1)[1], pen.ends(pair)[0]
@@ -172,7 +176,7 @@ def write_gaps(pen: Pen) -> None:
 
 
 def show_impacts(pen: Pen) -> None:
-    """Draw a star at every recent impact, and write the closing speeds of the two hardest."""
+    """Draw a star at every recent impact, and write the closing speeds (m/s) of the two hardest."""
 
     def x(impact: Impact) -> float:
         return (pen.ends(impact.pair + 1)[1] + pen.ends(impact.pair)[0]) / 2

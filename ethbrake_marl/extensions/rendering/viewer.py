@@ -17,6 +17,8 @@ SMOOTH_FPS = 50  # frames per second in the window, and default of `step_frames`
 
 
 class Viewer:
+    """Viewer of the mode ``rgb_array``: the present moment as a picture. The other viewers extend it."""
+
     def __init__(self, environment: Any) -> None:
         self.environment = environment
         self.many = hasattr(environment, "num_envs")
@@ -50,7 +52,7 @@ class Viewer:
         return picture(scene)
 
     def step_frames(self, fps: int = SMOOTH_FPS, row: int = 0) -> list[Any]:
-        """Last step of world ``row`` as pictures, ``fps`` per second of the episode."""
+        """Pictures of the last time step of world ``row``, ``fps`` per simulated second; each [304, 800, 3] uint8."""
         check_whole_number("step_frames: fps", fps, 1)
         motion = self.motion(row)
         count = max(round((motion.until_s - motion.start_s) * fps), 1)
@@ -69,10 +71,10 @@ class Words(Viewer):
 
 
 def import_pygame(many: bool = False) -> Any:
-    """Import the module pygame of the package pygame-ce, which draws the window of one world.
+    """Import pygame from the package pygame-ce, which draws the window of one world.
 
-    Raises ``MissingExtra``, or ``InvalidInput`` for ``many`` worlds, for an old pygame-ce, and if the package pygame
-    has put its module there.
+    Raises ``MissingExtra`` if it is not installed, and ``InvalidInput`` if ``many`` (there is no window for many
+    worlds), or if the installed module is an old pygame-ce or belongs to the package pygame.
     """
     if many:
         raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
@@ -115,6 +117,7 @@ class Window(Viewer):
         """Do nothing: the window shows every step by itself."""
 
     def _play(self) -> None:
+        """Show the last time step in the window, in real time. Open the window first; stop if the user closes it."""
         pygame = import_pygame()
         clock = pygame.time.Clock()
         for frame in [] if self.closed else self.step_frames():

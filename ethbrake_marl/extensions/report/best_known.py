@@ -1,4 +1,4 @@
-"""The best known harm of each world, if another extension has measured it."""
+"""Best known harm of each world, if another extension has measured it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,11 @@ UNAVOIDABLE = "proven_harm_impact"  # whether it is proven that no command avoid
 
 
 class BestKnown(NamedTuple):
+    """Least known harm in each of n worlds, and what is proven about contacts and impacts."""
+
     harm: Mapping[str, Floats]  # count -> [n] m2/s2: both harms and, if it is known, the honest cost
-    avoidable: Bools | None  # [n] whether contact can be avoided; None: not proven
-    unavoidable: Bools | None = None  # [n] whether it is proven that no command avoids an impact; None: not asked
+    avoidable: Bools | None  # [n] whether contact can be avoided (proven); None: not measured
+    unavoidable: Bools | None = None  # [n] whether no command avoids an impact (proven); None: not measured
 
     @classmethod
     def of(cls, result: Result) -> BestKnown | None:
@@ -33,6 +35,7 @@ class BestKnown(NamedTuple):
 
     @property
     def in_words(self) -> str:
+        """Sentences: mean best known harm, and share of the worlds in which no command avoids an impact."""
         first, total = (float(self.harm[count].mean()) for count in HARM)
         words = (
             f"Mean best known harm of these worlds, where pushing is free: {first:.2f} first-impact, {total:.2f} total."
@@ -49,7 +52,10 @@ class BestKnown(NamedTuple):
 
 
 def shown_counts(compared: Compared) -> dict[str, str]:
-    """Counts to show, count -> column: both harms, and what agents minimise if its best is known, too."""
+    """Counts to show, count -> column: first-impact harm, total harm, and the count that agents minimise.
+
+    The last one is left out if the best known harm is known only for others.
+    """
     best_known, minimised = BestKnown.of(compared.result), compared.harm_count
     return (
         HARM if best_known is not None and minimised not in best_known.harm else {**HARM, minimised: COLUMN[minimised]}

@@ -1,4 +1,4 @@
-"""Episodes of a report: which worlds are shown, and the player."""
+"""Episodes in a report: choice of the worlds to show, and the player of their episodes."""
 
 from __future__ import annotations
 
@@ -31,10 +31,11 @@ MOST_SHOWN = 3  # agents that are shown at the start
 def player(
     compared: Compared, focus: str, kinds: Mapping[int, str], records: Mapping[str, Sequence[EpisodeRecord]]
 ) -> Markup:
-    """Player of some worlds. It shows ``focus``, the agent that the page is about, and the last agent first.
+    """Player of the episodes of all agents in some worlds, as HTML.
 
-    ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, with
-    samples ``MOTION_SAMPLE_S`` apart.
+    At first it shows at most three agents: ``focus`` (the agent that the page is about), the first and the last.
+    ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, sampled
+    every ``MOTION_SAMPLE_S`` seconds.
     """
     result, agents, worlds = compared.result, list(records), list[dict[str, Any]]()
     for (row, kind), *episodes in zip(kinds.items(), *records.values(), strict=True):
@@ -79,12 +80,12 @@ def episode_data(record: EpisodeRecord) -> dict[str, Any]:
 
 
 def pieces_of(record: EpisodeRecord) -> Floats:
-    """Motion as pieces of constant acceleration, [k, 1 + 3 N].
+    """Motion in an episode as k pieces of constant acceleration, [k, 1 + 3 N].
 
-    The columns of a piece: the time at which it begins (s), place of Vehicle 1 (m), N - 1 gaps (m), N speeds (m/s), N
-    accelerations (m/s2). An impact between two samples ends a piece; the next one leads from there to the second
-    sample. If something else happens there as well, such as another impact, places are wrong by millimetres until the
-    second sample.
+    Columns: the time at which a piece begins (s), position of Vehicle 1 (m), N - 1 gaps (m), N speeds (m/s), N
+    accelerations (m/s2). An impact between two samples ends a piece; the next piece begins at the impact and leads to
+    the second sample. If another event lies between the two samples, such as another impact, positions are wrong by
+    millimetres until the second sample.
     """
     time_s, speeds, N = record.time_s, record.speeds_mps, record.speeds_mps.shape[1]
     rates = np.zeros_like(speeds)
@@ -102,7 +103,10 @@ def pieces_of(record: EpisodeRecord) -> Floats:
 
 
 def extrapolate(pieces: Floats, t: Floats, N: int) -> Floats:
-    """Pieces of motion of N vehicles (``pieces_of``), without times, ``t`` [k] seconds after they begin."""
+    """Positions, gaps, speeds and accelerations ``t`` [k] seconds after the beginning of k pieces of motion, [k, 3 N].
+
+    ``pieces``: as from ``pieces_of``, of N vehicles.
+    """
     speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
     ways = (speeds + 0.5 * rates * t) * t
     gaps = pieces[:, 2 : 1 + N] + ways[:, :-1] - ways[:, 1:]
@@ -115,10 +119,11 @@ def replaced_at_s(record: EpisodeRecord) -> list[float]:
 
 
 def _impacts(record: EpisodeRecord) -> list[list[float]]:
-    """Seven numbers of each impact, in order of time.
+    """Impacts of an episode in order of time, seven numbers each.
 
-    The time (s), the pair (-1: the obstacle), the closing speed (m/s), whether it is the pair's first impact, the
-    number of impacts so far, and both harms so far (m2/s2), which end with those of the episode.
+    Time (s), pair from 0 (-1: Vehicle 1 and the obstacle), closing speed (m/s), whether it is the pair's first impact,
+    and the number of impacts, first-impact harm and total harm so far (m2/s2). The last harms are exactly those of the
+    episode.
     """
     rows, last = record.impacts, record.last
     number, first, total = np.cumsum(rows.number), np.cumsum(rows.first_impact_harm), np.cumsum(rows.total_harm)
@@ -136,7 +141,7 @@ TYPICAL = (0.5, 0.6, 0.7, 0.8, 0.9)  # quantiles of the harm
 
 
 def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
-    """Choose at most ``MOST_WORLDS`` worlds in which to show the agent ``focus``; return row -> why it is shown."""
+    """Worlds in which to show the agent ``focus``, at most ``MOST_WORLDS``: row of the result -> why it is shown."""
     result, column = compared.result, COLUMN[compared.harm_count]
     cost, best_known, chosen = result[focus][column], BestKnown.of(result), dict[int, str]()
 
@@ -159,7 +164,10 @@ def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
 
 
 def worst_rows(compared: Compared, focus: str) -> Ints:
-    """At most ten rows in which ``focus`` did worst, by what agents minimise, minus the best known if any."""
+    """Rows of the worlds in which ``focus`` did worst, worst first, at most ten.
+
+    Worst: by the count that agents minimise, minus its best known value if there is one. Only values above 0.
+    """
     result, count, best_known = compared.result, compared.harm_count, BestKnown.of(compared.result)
     best = 0.0 if best_known is None else best_known.harm.get(count, 0.0)
     value = result[focus][COLUMN[count]] - best
@@ -172,10 +180,10 @@ def rows_by_value(value: Floats, among: Bools) -> Ints:
 
 
 def episodes_section(compared: Compared, focus: str, kinds: dict[int, str]) -> Section:
-    """Let every team drive the worlds ``kinds`` (row -> why it is shown) again, and return a player of these episodes.
+    """Section with a player of the worlds ``kinds`` (row -> why it is shown), in which every team drives once more.
 
-    ``focus``: the agent that the page is about. A note names each agent that drove differently in these episodes than
-    in the evaluation.
+    ``focus``: the agent that the page is about. A note names every agent whose harm in these episodes differs from its
+    harm in the evaluation.
     """
     rows, worlds, (_, game) = [*kinds], compared.worlds(kinds), open_game(compared.scenario)
     records = {agent: record_episodes(worlds, team, game, MOTION_SAMPLE_S) for agent, team in compared.teams.items()}

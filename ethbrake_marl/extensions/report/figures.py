@@ -55,9 +55,9 @@ EstimateCurve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by sid
 
 
 def curve_over_seeds(trainings: Sequence[Mapping[Any, float]]) -> EstimateCurve:
-    """Mean of several training runs, plus and minus one standard deviation over the seeds.
+    """Mean of several training runs, with an interval of one standard deviation over the seeds on both sides.
 
-    ``trainings``: for each run, step or progress -> value. The curve has the steps that all runs have.
+    ``trainings``: for each run, step or progress -> value. The curve has the steps that all runs share.
     """
     curve = {}
     for step in sorted(set.intersection(*map(set, trainings))):
@@ -76,10 +76,11 @@ def curves_figure(
     lines: Mapping[str, Mapping[str, float]] | None = None,
     y_label: str = "",
 ) -> Figure:
-    """Draw curves with a band between the ends of their intervals, one panel for each title.
+    """Draw curves with their intervals as bands, one panel for each title.
 
-    ``panels``: title -> label of a curve -> curve; the first panel must have all labels, for the legend. ``lines``:
-    value of a horizontal line, title -> label -> value. ``y_label``: shared by all panels; "": each has its own.
+    ``panels``: title -> label of a curve -> curve; the legend shows the curves of the first panel, so it must have all
+    labels. ``lines``: title -> label -> value of a horizontal line. ``y_label``: label of a vertical axis that all
+    panels share; "": every panel has a vertical axis without a label.
     """
     figure, all_axes = new_panels((5.0 * len(panels), 4.2), columns=len(panels), sharey=bool(y_label))
     labels = [*dict.fromkeys(label for curves in panels.values() for label in curves)]
@@ -112,7 +113,7 @@ BINS = 12  # groups of worlds with similar gaps
 def harm_by_agent(compared: Compared, tests: Mapping[str, Compared]) -> Figure:
     """Draw the mean harm of each agent as a bar with its 95 % interval.
 
-    A vertical line shows the mean best known harm. Marks show the agents' means in other tests, title -> results.
+    A vertical line shows the mean best known harm. Marks show the agents' means in other ``tests``, title -> results.
     """
     count, result, best_known = compared.harm_count, compared.result, BestKnown.of(compared.result)
     agents = list(result.columns)
@@ -140,7 +141,10 @@ def harm_by_agent(compared: Compared, tests: Mapping[str, Compared]) -> Figure:
 
 @in_our_style
 def harm_above(compared: Compared) -> Figure:
-    """Draw, for every x, the share of worlds in which an agent's regret (or harm, if no best is known) is above x."""
+    """Draw, for every x, the share of worlds in which an agent's regret (harm minus best known harm) is above x.
+
+    If no best known harm has been measured, harm takes the place of regret.
+    """
     result, best_known, counts = compared.result, BestKnown.of(compared.result), shown_counts(compared)
     figure, panels = new_panels((10.0, 3.8), columns=len(counts), sharey=True)
     for axes, (count, harm) in zip(panels, counts.items(), strict=True):
@@ -163,8 +167,8 @@ def harm_above(compared: Compared) -> Figure:
 def harm_against_total_gap(result: Result) -> Figure:
     """Draw each agent's mean harm, with 95 % intervals, against the sum of the gaps at the alert.
 
-    Worlds are grouped by this sum, in ``BINS`` intervals of equal width. If agents minimise the honest cost, a third
-    panel shows it.
+    Worlds are grouped by this sum, in ``BINS`` intervals of equal width. The panels show first-impact harm, total harm
+    and, if agents minimise it, the honest cost.
     """
     minimised = result.about.get("agent_settings", {}).get("harm_count", "first")
     counts = ({**HARM, minimised: COLUMN[minimised]}).items()
@@ -197,9 +201,9 @@ DECELERATION_POINTS = 2001  # evenly spaced decelerations
 
 
 def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float) -> Floats:
-    """Harm if vehicle ``body`` holds each of the decelerations ``at`` [C] (m/s2), [3, C] m2/s2.
+    """Harm in one world if vehicle ``body`` holds one of the C decelerations ``at`` (m/s2), [3, C] m2/s2.
 
-    Rows: first-impact harm predicted by the paper's closed form, and simulated first-impact and total harm.
+    Rows: first-impact harm predicted by the paper's closed form; simulated first-impact harm; simulated total harm.
     """
     braking, wait = np.ascontiguousarray(capacities(world.car, BRAKING, world.time_s)[0]), world.car[0, LATENCY].copy()
     priced: Any = harm_of_deceleration
@@ -211,12 +215,12 @@ def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float)
 def deceleration_figure(
     world: State, scenario: AnyScenario, *, best_known: Mapping[str, float] | None = None, title: str = ""
 ) -> Figure:
-    """Draw predicted and simulated harm of one world against the constant deceleration of the scenario's learner.
+    """Draw predicted and simulated harm in one world against the constant deceleration of the scenario's learner.
 
-    Marks show the decelerations that E-V2X-BM chooses, by the closed form and by simulation. ``best_known``: best known
-    harm of this world over all commands, ``first`` and ``total``, drawn as lines.
+    Marks show the decelerations that E-V2X-BM chooses, by the closed form and by simulation. ``best_known``: least
+    known harm in this world under any commands, ``first`` and ``total`` -> m2/s2, drawn as horizontal lines.
 
-    Raises ``InvalidInput`` unless there is one world, one learner, and no script that looks at the state.
+    Raises ``InvalidInput`` unless there is exactly one world and one learner, and no script that looks at the state.
     """
     loaded, game = open_game(scenario)
     if world.n != 1 or len(loaded.learners) != 1 or game.scripts:
@@ -274,9 +278,10 @@ IMPACT: dict[str, Any] = {"marker": "X", "s": 60.0, "edgecolor": "black", "linew
 
 @in_our_style
 def trajectories(records: Mapping[str, EpisodeRecord]) -> Figure:
-    """Draw recorded episodes (title -> episode), one column each, all with the same scales.
+    """Draw positions, gaps and commands in recorded episodes over time: one column for each episode, equal scales.
 
-    A caption states the quantities of the first world. Raises ``InvalidInput`` if there are no episodes.
+    ``records``: title -> episode. The caption states the quantities of the first episode's world. Raises
+    ``InvalidInput`` if there are no episodes.
     """
     if not records:
         raise InvalidInput("trajectories: there are no records; give at least one recorded episode")
@@ -314,6 +319,7 @@ def _style(body: int) -> dict[str, Any]:
 
 
 def _positions(axes: Axes, record: EpisodeRecord) -> None:
+    """Draw positions of vehicles and obstacle over time, and impacts; first impacts with their closing speed (m/s)."""
     for i, places in enumerate(record.positions_m.T):
         axes.plot(record.time_s, places, label=f"Vehicle {i + 1}", **_style(i + 1))
     obstacle = float(record.initial.obstacle_gap_m[0])
@@ -367,7 +373,10 @@ def write_worlds(path: Path, scenario: Scenario, episodes: int, *, seed: int, fo
 
 @in_our_style
 def worlds_figure(scenario: Scenario, drawn_worlds: DrawnWorlds, *, seed: int) -> Figure:
-    """Draw the distribution of each quantity that differs between worlds, and three worlds at the alert."""
+    """Draw the distribution of each quantity that differs between worlds, and three worlds at the alert.
+
+    These have the smallest, the median and the largest sum of gaps.
+    """
     varying = _varying_quantities(drawn_worlds)
     columns = min(max(len(varying), 1), ABREAST)
     rows = -(-len(varying) // columns)
@@ -397,6 +406,7 @@ def _varying_quantities(drawn_worlds: DrawnWorlds) -> dict[Rule, dict[int, Float
 
 
 def _distribution(axes: Axes, rule: Rule, entries: dict[int, Floats]) -> None:
+    """Draw the distribution of a quantity. ``entries``: number of vehicle or pair, from 0 -> value in each world."""
     values = [column[~np.isnan(column)] for column in entries.values()]
     axes.hist(
         values,

@@ -1,7 +1,7 @@
-"""HTML pages, filled from the templates in this folder. Each page is a single file, which loads no other file.
+"""HTML pages, filled from the templates in this folder. A page is a single file, which loads no other file.
 
-Texts are escaped, so characters such as < are shown and never act as HTML. Control characters, and characters that
-change the writing direction, are shown as Python escapes.
+Texts are escaped: characters such as < are shown and never act as HTML. Control characters, and characters that change
+the writing direction, are shown as Python escapes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Section(NamedTuple):
 
 
 def whole_page(title: str, lead: str, opening: Sequence[Markup], sections: Sequence[Section]) -> str:
-    """Page. ``lead`` is the text below its title; ``opening``, parts above the table of contents."""
+    """Complete HTML page. ``lead``: text below the title. ``opening``: parts above the table of contents."""
     style, script = (Markup("\n".join(map(read_file, names))) for names in (_STYLES, _SCRIPTS))
     values = {"title": title, "lead": lead, "opening": opening, "sections": sections, "style": style, "script": script}
     return str(fill("page.html.j2", **values))
@@ -49,14 +49,14 @@ def page_part(name: str, *values: object) -> Markup:
 
 
 def table(sheet: Sheet) -> Markup:
-    """Table as HTML, with title and note. Pandas, which writes plain tables, is not in the extra."""
+    """HTML of a table, with its title and note."""
     return page_part("table", sheet)
 
 
 def drawing(figure: Figure, title: str, description: str) -> Markup:
     """HTML of a figure, with ``title`` and ``description`` for screen readers.
 
-    The caption moves from the picture to the page, so that a phone can show it.
+    The caption is removed from the figure and becomes text of the page, so that it also fits a phone.
     """
     caption = " ".join(figure.get_supxlabel().split())
     figure.supxlabel("")
@@ -78,17 +78,26 @@ def data(name: str, content: object) -> Markup:
 
 
 def fill(file: str, **values: Any) -> Markup:
-    """Template filled with values. HTML (``Markup``) stays unchanged, everything else is escaped."""
+    """HTML of the template ``file``, filled with values.
+
+    Values that are HTML (``Markup``) stay unchanged; all others are escaped.
+    """
     return Markup(_environment().get_template(file).render(values))
 
 
 def printable_text(value: object) -> str:
-    """``value`` as text; control characters, and characters that change the writing direction, are escaped."""
+    """``value`` as text. Control characters, and characters that change the writing direction, become Python escapes.
+
+    HTML (``Markup``) stays unchanged.
+    """
     return value if isinstance(value, Markup) else plain_text(str(value), keep=_STAY)
 
 
 def breakable(name: str) -> Markup:
-    """Text with places for line breaks after signs, as in ``e_v2x_bm:pairwise``; HTML stays unchanged."""
+    """HTML of a name that may break after ``:``, ``+``, ``@``, ``,`` and ``/``, such as ``e_v2x_bm:pairwise``.
+
+    HTML (``Markup``) stays unchanged.
+    """
     return name if isinstance(name, Markup) else Markup("<wbr>").join(map(printable_text, _AFTER_SIGN.split(name)))
 
 

@@ -1,4 +1,4 @@
-"""The paper's two tables of results, and the scenarios whose results stand beside them."""
+"""The paper's two tables of results, and the scenarios whose reports show them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 
 class PaperRow(NamedTuple):
-    """One row of a table of results as printed in the paper.
+    """One row of a table of results as the paper prints it.
 
     The paper counts first-impact harm, and gives no confidence intervals.
     """
@@ -64,7 +64,7 @@ SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant
 
 
 def is_papers_test(scenario: Scenario) -> bool:
-    """Whether results in this scenario can be compared with the paper's."""
+    """Whether results in a scenario can be compared with the paper's: a shipped one in ``SHOWN_WITH``, unchanged."""
     return scenario.name in SHOWN_WITH and is_as_shipped(scenario)
 
 

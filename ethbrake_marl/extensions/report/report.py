@@ -1,4 +1,4 @@
-"""The report of an evaluation: its first sentence, tables, figures and worst worlds."""
+"""Report of an evaluation: first sentence, tables, figures and worst worlds."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ COUNTED_WORDS = {  # count -> verb, noun, and what is counted
 def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]) -> str:
     """First sentence of the page: the harm of the agent ``focus`` compared with full braking.
 
-    It names the tests in which the agent does about as much harm as full braking, or more. ``tests``: title -> results
-    of the same agents in another test.
+    It also names the tests in which the agent does not do less harm than full braking. ``tests``: title of another test
+    -> its results with the same agents.
     """
     count, harm = compared.harm_count, COLUMN[compared.harm_count]
     rows, best_known = {row.agent: row for row in compared.table}, BestKnown.of(compared.result)
@@ -71,7 +71,10 @@ def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]
 
 
 def change_of(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """How an agent's harm differs from full braking's: "as much" if the 95 % interval contains 0."""
+    """Whether an agent does less or more harm than full braking. ``harm``: column of the harm.
+
+    "as much": the 95 % interval of the difference contains 0, or is unknown.
+    """
     difference = row[f"{harm}_difference"]
     if difference is None or (difference.interval is None and row.episodes > 1):
         return "as much"
@@ -98,7 +101,7 @@ class Test(NamedTuple):
 
 @dataclass(frozen=True)
 class ReportPage:
-    """Content of the page. Its agents drive some worlds again when the page is made."""
+    """Content of a report. When the page is made, its agents drive the worlds that it shows once more."""
 
     title: str
     compared: Compared
@@ -112,6 +115,7 @@ class ReportPage:
 
     @property
     def html(self) -> str:
+        """The page as HTML. The agents drive the worlds that it shows once more."""
         compared, rows = self.compared, self.compared.table
         focus = self.focus or [row.agent for row in rows if row.policies or row is rows[-1]][-1]
         kinds = shown_worlds(compared, focus)
@@ -157,7 +161,10 @@ def measure_parts(agents: SummaryTable) -> list[Markup]:
 
 
 def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> Section:
-    """Worlds in which ``focus`` did worst, at most ten. Those that the player shows have a button."""
+    """Section with a table of the worlds in which ``focus`` did worst, at most ten.
+
+    ``watched``: rows of the worlds in the player; they get a button that starts it.
+    """
     result, known_best, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
     counts = {**HARM, minimised: COLUMN[minimised]}
     columns = {IN_WORDS[count].capitalize(): result[focus][column] for count, column in counts.items()}
@@ -181,6 +188,11 @@ def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> S
 
 
 def avoidable_section(compared: Compared) -> Section:
+    """Section on regret (harm minus best known harm): a figure, and tables.
+
+    The tables divide the worlds by whether an impact is proven unavoidable. If no best known harm has been measured:
+    only a figure of the harm.
+    """
     result, best_known, figure = compared.result, BestKnown.of(compared.result), harm_above(compared)
     if best_known is None:
         words = "For each harm x: share of the worlds in which an agent did more harm than x."
@@ -200,6 +212,10 @@ def avoidable_section(compared: Compared) -> Section:
 
 
 def _harm_among(compared: Compared, best_known: BestKnown, where: str, among: Bools) -> Sheet:
+    """Table of each agent's collision rate, harm and regret in the worlds of the mask ``among`` [n].
+
+    ``where``: description of these worlds, for the title.
+    """
     result, counts = compared.result, shown_counts(compared)
     some, rows = result.take(among), []
     for agent, harm_columns in some.columns.items():

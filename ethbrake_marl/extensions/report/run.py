@@ -1,4 +1,4 @@
-"""The report of a run: training, the three tests, learners, and the paper's table."""
+"""Report of a training run: learning curves, the three tests, several learners, and the paper's tables."""
 
 from __future__ import annotations
 
@@ -46,7 +46,10 @@ class RunReport:
     measures: tuple[str, ...] = (*Tables.measures, *REPORT_MEASURES)
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
-        """Write the results in the other tests, pictures and page. Return tables to print, and where the page is."""
+        """Write the results in the other tests, the figures and the page to the run's folder.
+
+        Returns tables to print, and a text that says where the page is.
+        """
         compared, folder = experiment.compared, experiment.trained.directory
         single = experiment.learned != TEAM
         tests, stage_numbers = other_tests(compared.scenario) if single else [], count()
@@ -77,6 +80,7 @@ class RunReport:
 
 
 def write_figures(experiment: Experiment) -> list[Markup]:
+    """Draw the learning curve, harm against the total gap, and one episode. Write them as PNG; return them as HTML."""
     compared, learned, trained = experiment.compared, experiment.learned, experiment.trained
     recipe, (_, game) = trained.training.recipe, open_game(compared.scenario)
     typical_row = telling_row(compared, learned)
@@ -125,7 +129,10 @@ def write_figures(experiment: Experiment) -> list[Markup]:
 
 
 def telling_row(compared: Compared, learned: str) -> int:
-    """Row of a typical world: the median harm saved by ``learned``, where full braking does harm."""
+    """Row of a typical world: of the worlds in which full braking does harm, the one with the median saving of harm.
+
+    The saving is that of the agent ``learned``. Row 0 if full braking does no harm.
+    """
     harm = COLUMN[compared.harm_count]
     before = compared.result[BASELINE][harm]
     rows = np.flatnonzero(before > 0.0)
@@ -138,6 +145,11 @@ def telling_row(compared: Compared, learned: str) -> int:
 def report_page(
     experiment: Experiment, test_results: Mapping[str, Compared], figures: Sequence[Markup], learners: Sequence[Sheet]
 ) -> ReportPage:
+    """Page about a training run: settings, the compared agents, the paper's rows (in its own test), and other tests.
+
+    ``test_results``: name of another test -> its results. ``figures``: HTML of the figures. ``learners``: tables about
+    several learners.
+    """
     trained, compared, learned = experiment.trained, experiment.compared, experiment.learned
     training, recipe, name = trained.training, trained.training.recipe, compared.scenario.name
     steps = next(iter(trained.policies.values())).manifest.steps
@@ -193,6 +205,7 @@ def _counts(compared: Compared) -> list[str]:
 
 
 def _borne_sheet(compared: Compared, count: str) -> Sheet:
+    """Table of the mean harm that each vehicle and the whole line bear under each agent. ``count``: count of harm."""
     scenario, by = compared.scenario, compared.result.clusters
     names = [name.replace("_", " ").capitalize() for name in scenario.vehicle_names]
     columns = [Column("Agent", "agent", text=True)]
@@ -207,6 +220,7 @@ def _borne_sheet(compared: Compared, count: str) -> Sheet:
 
 
 def _added_sheet(compared: Compared) -> Sheet:
+    """Table of the harm that is added if a learner of the trained team brakes fully instead, for each learner."""
     result, counts, rows = compared.result, _counts(compared), list[Row]()
     for name in (compared.scenario.vehicle_names[body - 1] for body in compared.scenario.learners):
         pairs = ((result[without(name)][COLUMN[count]], result[TEAM][COLUMN[count]]) for count in counts)

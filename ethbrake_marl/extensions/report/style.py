@@ -82,24 +82,24 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
-    """Figure with ``rows`` times ``columns`` panels, and their axes, row by row.
+    """Figure with ``rows`` times ``columns`` panels, and the axes of the panels, row by row.
 
-    ``size_in``: width and height in inches. ``how``: arguments of matplotlib's ``subplots``.
+    ``size_in``: width and height in inches. ``how``: further arguments of matplotlib's ``subplots``.
     """
     figure = new_figure(*size_in)
     return figure, list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
 
 
 def series_style(number: int) -> dict[str, Any]:
-    """Style of curve ``number`` (from 0) for matplotlib's ``plot``. After the last style they repeat."""
+    """Style of curve ``number`` (from 0), as arguments of matplotlib's ``plot``. The seven styles repeat."""
     k = number % len(PALETTE)
     return {"color": PALETTE[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
 
 
 def label_text(text: str, most: int = 40) -> str:
-    """``text`` as a label of at most ``most`` characters.
+    """``text`` as a label of at most ``most`` characters; a longer text is cut in the middle.
 
-    Dollar signs do not start a formula, and characters that the font lacks are escaped.
+    A dollar sign does not start a formula, and characters that the font lacks are escaped.
     """
     signs = font_signs()
     label = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
@@ -118,7 +118,7 @@ def band(axes: Axes, x: Sequence[float] | Floats, low: Any, high: Any, style: Ma
 def finish(
     figure: Figure, caption: str, legend: Axes | None = None, *, columns: int = 6, fontsize: float = 9
 ) -> Figure:
-    """Add a caption and, if ``legend`` is given, the legend of this panel above all panels."""
+    """Add a caption to a figure, and return the figure. ``legend``: panel whose legend is put above all panels."""
     if legend is not None:
         named = legend.get_legend_handles_labels()
         figure.legend(*named, loc="outside upper left", ncols=columns, frameon=False, fontsize=fontsize)
@@ -129,9 +129,9 @@ def finish(
 
 @in_our_style
 def picture_bytes(figure: Figure, path: str | Path) -> bytes:
-    """PNG, SVG or PDF file, by the ending of ``path``. The same figure always gives the same bytes.
+    """Content of a PNG, SVG or PDF file; the ending of ``path`` selects the format. No file is written.
 
-    Raises ``InvalidInput`` for another ending.
+    The same figure always gives the same bytes. Raises ``InvalidInput`` for any other ending.
     """
     ending = Path(path).suffix.lower()
     if ending not in _NO_DATES:
@@ -142,16 +142,16 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
 
 
 def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
-    """Write ``figure`` to a PNG, SVG or PDF file, by the ending of ``path``.
+    """Write ``figure`` to a PNG, SVG or PDF file; the ending of ``path`` selects the format.
 
-    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` for another ending or if the file cannot
-    be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
+    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` for any other ending or if the file
+    cannot be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
     """
     write_output(path, picture_bytes(figure, path), force=force)
 
 
 def plain_number(value: float, _: int) -> str:
-    """Number of an axis label as text such as 1000, not as a power of ten."""
+    """Number on an axis as text such as 1000, not as a power of ten. The second argument, a position, is unused."""
     return f"{value:g}"
 
 

@@ -27,12 +27,12 @@ SHORT_TABLE = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of t
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
-    """Whether a scenario equals the shipped one of its name, except title, description and source."""
+    """Whether a scenario equals the shipped scenario of the same name, apart from title, description and source."""
     return scenario.content(without=DESCRIPTIVE_KEYS) == load_scenario(scenario.name).content(without=DESCRIPTIVE_KEYS)
 
 
 def other_tests(scenario: Scenario) -> list[Scenario]:
-    """The two other shipped tests; nothing for a scenario that is not shipped."""
+    """The other two of the three shipped tests. Empty unless ``scenario`` is one of the three, unchanged."""
     if scenario.name not in TESTS or not is_as_shipped(scenario):
         return []
     return [load_scenario(name) for name in TESTS if name != scenario.name]
@@ -43,9 +43,10 @@ def title_of(name: str) -> str:
 
 
 def short_sheet(compared: Compared, test_results: Mapping[str, Compared]) -> Sheet:
-    """Short table: collision rate, both harms and, if agents minimise it, the honest cost with the push.
+    """Short table of agents: collision rate, first-impact and total harm.
 
-    ``test_results``: results in other tests, name -> results; their means follow below.
+    If agents minimise the honest cost, also this cost and the push. ``test_results``: name of another test -> its
+    results, whose means follow as further rows.
     """
     table = compared.table
     full_sheet = table.terminal()

@@ -77,9 +77,10 @@ def reproduce_command(
 
 
 def chosen_policies(text: str) -> dict[str, str]:
-    """Agents to use as PPO and SAC: name -> agent name. ``text`` replaces some, such as ``ppo=policy@RUN``.
+    """Agents in the place of the paper's policies: ``PPO`` and ``SAC`` -> agent name.
 
-    Raises ``InvalidInput`` if one cannot drive here.
+    ``text``: replacements of the shipped policies, such as ``ppo=policy@RUN``. Raises ``InvalidInput`` for any other
+    text, and for an agent that cannot drive in the random test.
     """
     from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS, WORLD_FIELDS, drive_all
     from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED

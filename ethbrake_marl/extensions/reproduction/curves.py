@@ -1,4 +1,7 @@
-"""Harm against distance and delay: the figures ``Fig:Harm-ivds``, ``Fig:harm-delay`` and ``Fig:hybrid illu``."""
+"""Harm against distance and delay: the figures ``Fig:Harm-ivds``, ``Fig:harm-delay`` and ``Fig:hybrid illu``.
+
+A *reading* is one interpretation of the paper's text (``readings``).
+"""
 
 from __future__ import annotations
 
@@ -38,9 +41,10 @@ EXPECTED, PROVEN, ALONE = "E-V2X-BM, predicted", "least harm, proven", "PPO, not
 
 
 def harm_of_strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Floats]:
-    """First-impact harm of each strategy under a reading of the paper's text: strategy -> [n] m2/s2.
+    """First-impact harm of each strategy under one interpretation (``reading``) of the paper: name -> [n] m2/s2.
 
-    ``policies``: name -> agent name. What E-V2X-BM predicts and, for exact impacts, the proven bound are included.
+    ``policies``: name -> agent name. Also contains the harm that E-V2X-BM predicts and, for exact impacts, the proven
+    lower bound.
     """
     outcomes = strategies(reading, episodes, policies)
     lines = {name: outcome["first"] for name, outcome in outcomes.items()} | {EXPECTED: outcomes[E_V2X_BM][PREDICTED]}
@@ -48,9 +52,9 @@ def harm_of_strategies(reading: Reading, episodes: int, policies: Mapping[str, s
 
 
 def process_lines(reading: Reading, episodes: int, settings: ReproductionSettings) -> dict[str, Floats]:
-    """Harm in the paper's fixed-step map, with policies trained as in the paper: strategy -> [seeds, n].
+    """First-impact harm (m2/s2) in the paper's fixed-step map, with policies trained as in the paper: name -> array.
 
-    In m2/s2. Strategies without a policy have [n]. Empty without such trainings.
+    The array is [seeds, n] for a trained policy and [n] for other strategies. Empty if there are no such trainings.
     """
     outcomes = of_the_process(reading, episodes, settings)
     trained = {name: np.stack([seed[name]["first"] for seed in seeds]) for name, seeds in outcomes.items()}
@@ -58,9 +62,9 @@ def process_lines(reading: Reading, episodes: int, settings: ReproductionSetting
 
 
 def mean_harm(line: Floats, rows: Floats) -> Estimate:
-    """Mean of the harm ``line``, [n] or [seeds, n], in the worlds ``rows``, with a 95 % interval.
+    """Mean of the harm ``line`` over the worlds ``rows`` (mask, [n]), with a 95 % interval.
 
-    The interval is over the worlds or, if there are several seeds, over the seeds.
+    If ``line`` is [n], the interval is over worlds; if it is [training seeds, n], over the seeds.
     """
     return mean(line[rows]) if line.ndim == 1 else mean(line[:, rows].mean(axis=1))
 
@@ -78,10 +82,10 @@ def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
 
 
 def show_harm(stem: str, title: str, readings: Mapping[str, Groups], legend: Sequence[str], x_label: str) -> Made:
-    """Figure of mean harm, with a panel for each reading of the paper, and a table for each.
+    """Figure of mean harm, and tables: one panel and one table for each reading (interpretation of the paper's text).
 
-    ``readings``: name of the reading -> ``Groups`` of worlds. ``legend``: strategies that the figure shows. ``stem``:
-    of its file's name.
+    ``readings``: name -> group of worlds -> harm of each strategy, and mask of the group's worlds. ``legend``:
+    strategies in the figure. ``stem``: name of the figure's file without its ending.
     """
     estimates = {
         reading: {
@@ -121,6 +125,7 @@ def distances(settings: ReproductionSettings, policies: Mapping[str, str]) -> di
 
 
 def reproduce_distance(settings: ReproductionSettings) -> Made:
+    """Fig. 4: harm of each strategy over the sum of both gaps at the alert, and the paper's statements about it."""
     readings = distances(settings, settings.policies)
     stated, nearest = (statements(groups, settings.policies) for groups in readings.values())
     distance_reading, episodes = STATED._replace(base=DISTANCE), min(DISTANCE_WORLDS, settings.episodes)
@@ -158,7 +163,7 @@ ONE = (("gaps_m", (7.0, 7.0)), ("speeds_mps", (20.0, 18.0, 20.0)))  # the world 
 
 
 def reproduce_delays(settings: ReproductionSettings) -> Made:
-    """Reproduce the harm at three delays, which we chose, in the single world of the paper's figure."""
+    """Fig. 5: harm of each strategy at three delays, which are our choice, in the one world of the paper's figure."""
     groups, trained, only_world = {}, {}, np.array([True])
     for delay in DELAYS:
         reading = STATED._replace(base=f"paper-delay-{delay}", others=ONE)
@@ -180,6 +185,7 @@ def reproduce_delays(settings: ReproductionSettings) -> Made:
 
 
 def reproduce_illustration(settings: ReproductionSettings) -> Made:
+    """Fig. 8: harm over the distance, and in how many worlds the hybrid does not pick the strategy of lower harm."""
     readings = distances(settings, {ALONE: unconverged(settings.folder)})
     hybrid = f"Hybrid {ALONE}"
     counts, shares, texts = [], [], []

@@ -1,6 +1,6 @@
-"""Tables as Markdown and LaTeX, for the page and its files: pandas is not in the extra ``report``.
+"""Write tables (``Sheet``) as Markdown and LaTeX: pandas, which could do it, is not in the extra ``report``.
 
-Only what tables of the reproduction need: they have no sections, and no cell has two lines.
+Only for tables of the reproduction, which have no sections and no cell with two lines.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ LATEX = str.maketrans({
 
 
 def sheet_texts(sheet: Sheet) -> list[list[str]]:
-    """Texts of headings and rows."""
+    """Texts of the headings, then of the cells of each row."""
     return [
         sheet.headings,
         *([cell.in_words for cell in row if not isinstance(cell, str)] for row in sheet.formatted_rows()),
@@ -22,7 +22,7 @@ def sheet_texts(sheet: Sheet) -> list[list[str]]:
 
 
 def markdown(sheet: Sheet) -> str:
-    """Table as Markdown, without title and note."""
+    """Table as Markdown, without its title and note."""
     heads, *rows = sheet_texts(sheet)
     rule = ["---" if column.text else "---:" for column in sheet.formats]
     escaped = [[text.replace("|", "\\|") for text in row] for row in rows]
@@ -30,7 +30,7 @@ def markdown(sheet: Sheet) -> str:
 
 
 def latex(sheet: Sheet) -> str:
-    """LaTeX ``tabular`` for the package ``booktabs``, without title and note."""
+    """Table as a LaTeX ``tabular`` that needs the package ``booktabs``, without its title and note."""
     heads, *rows = (" & ".join(text.translate(LATEX) for text in line) + r" \\" for line in sheet_texts(sheet))
     kinds = "".join("l" if column.text else "r" for column in sheet.formats)
     begin, end = [rf"\begin{{tabular}}{{{kinds}}}", r"\toprule"], [r"\bottomrule", r"\end{tabular}"]

@@ -1,4 +1,7 @@
-"""The paper's figures and tables, in its order, and the list of what it leaves open; write them to a folder."""
+"""Reproduce the paper's figures and tables, in the paper's order, and write them to a folder.
+
+The last item is the register of the quantities that the paper leaves open.
+"""
 
 from __future__ import annotations
 
@@ -125,9 +128,10 @@ def cost(settings: ReproductionSettings, items: Sequence[Item]) -> str:
 def reproduce(
     settings: ReproductionSettings, items: Sequence[Item], machine: str, *, force: bool = False
 ) -> dict[Item, Made] | None:
-    """Train what is missing, and write figures, tables and a page. Return None if Ctrl-C stopped a training.
+    """Results of each item, or None if Ctrl-C stopped a training.
 
-    Finished trainings in the folder are used. Raises ``AlreadyExists`` if the folder has results and ``force`` is
+    Trains policies that the folder of ``settings`` lacks, and writes figures, tables and a page to it. ``machine``:
+    description of the computer, for the page. Raises ``AlreadyExists`` if the folder has results and ``force`` is
     false.
     """
     folder, results = settings.folder, {}
@@ -158,6 +162,7 @@ def command_line(settings: ReproductionSettings, items: Sequence[Item]) -> str:
 
 
 def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[DrawnFigure] = ()) -> None:
+    """Write figures as SVG and PDF, and tables as CSV and LaTeX, to the folder ``place``. Replace existing files."""
     if figures or sheets:
         place.mkdir(parents=True, exist_ok=True)
     for picture in figures:
@@ -190,6 +195,7 @@ def overview(results: Mapping[Item, Made]) -> Sheet:
 
 
 def page(made_by: str, results: Mapping[Item, Made], settings: ReproductionSettings) -> str:
+    """Page of all results as Markdown. ``made_by``: command, date, computer and versions."""
     lead = f"Numbers, statements and figures of {PAPER}, and ours. Made by {made_by}."
     parts = [
         "# The paper, reproduced",

@@ -1,8 +1,9 @@
-"""Trainings by the paper's own process, and its learning curves.
+"""Trainings by the paper's own process, and the learning curves of these trainings.
 
-The process consists of the recipes ``ppo-paper`` and ``sac-paper`` in the paper's map: five seeds in the random test,
-three at a high and a low delay (``fig:ppo_sac_high_latency``, ``fig:ppo_sac_low_latency``). Another PPO training, with
-our recipe, is stopped before it has converged.
+The process uses the recipes ``ppo-paper`` and ``sac-paper`` in the paper's fixed-step map (``physics: paper-map``):
+five seeds in the random test, and three each at a high and a low delay (``fig:ppo_sac_high_latency``,
+``fig:ppo_sac_low_latency``). For the paper's policy that has not converged, a PPO training with our recipe is stopped
+early.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 
 RANDOM, HIGH, LOW, STOPPED = "random", "high", "low", "stopped"
-STATUS = "run.json"  # of a run
+STATUS = "run.json"  # file with the status of a run
 
 
 class TrainingPlan(NamedTuple):
     scenario: str
     recipe: str
     seeds: int
-    seconds: float  # of each on one core, to tell how long it takes
+    seconds: float  # processor time of the training of one seed, for estimates
     decisions: int | None = None  # None: those of the recipe
     mapped: bool = True  # in the paper's map
 
@@ -61,9 +62,9 @@ def is_finished(run: Path) -> bool:
 
 
 def finished_runs(folder: Path, group: str) -> dict[str, list[Path]]:
-    """Finished trainings of a group of trainings (such as ``RANDOM``): recipe -> folder for each seed.
+    """Folders of the finished trainings in a group, such as ``RANDOM``: recipe -> one folder for each seed.
 
-    Recipes with an unfinished training are left out.
+    A recipe is left out unless the trainings of all its seeds are finished.
     """
     runs_of_recipe = {plan.recipe: runs_of(folder, group, plan) for plan in TRAINING_GROUPS[group]}
     return {recipe: runs for recipe, runs in runs_of_recipe.items() if all(map(is_finished, runs))}
@@ -75,9 +76,9 @@ def seconds_left(folder: Path, groups: Iterable[str]) -> float:
 
 
 def train_groups(settings: ReproductionSettings, groups: Iterable[str]) -> bool:
-    """Start, or continue, the unfinished trainings of some groups. Return False if Ctrl-C stopped one.
+    """Start or continue the unfinished trainings of groups such as ``RANDOM``. Return False if Ctrl-C stopped one.
 
-    Raises ``MissingExtra`` without torch, and the errors of ``eb.train`` and ``eb.resume``.
+    Raises ``MissingExtra`` if torch is not installed, and the errors of ``eb.train`` and ``eb.resume``.
     """
     for group in groups:
         for plan in TRAINING_GROUPS[group]:
@@ -88,6 +89,7 @@ def train_groups(settings: ReproductionSettings, groups: Iterable[str]) -> bool:
 
 
 def _train(plan: TrainingPlan, run: Path, seed: int, settings: ReproductionSettings) -> bool:
+    """Start or continue the training of one seed in the folder ``run``. Return False if Ctrl-C stopped it."""
     import ethbrake_marl as eb
 
     if (run / STATUS).is_file():
@@ -102,15 +104,18 @@ def _train(plan: TrainingPlan, run: Path, seed: int, settings: ReproductionSetti
 
 
 def unconverged(folder: Path) -> str:
-    """Agent name of the policy that the paper calls "obtained from training before convergence occurred"."""
+    """Agent name of our PPO policy whose training is stopped after a fifteenth of the recipe's decisions.
+
+    It stands for the paper's policy "obtained from training before convergence occurred".
+    """
     ((run,),) = finished_runs(folder, STOPPED).values()
     return f"policy@{run / 'policy-last'}"
 
 
 def process(settings: ReproductionSettings, group: str = RANDOM) -> dict[str, list[str]]:
-    """Policies trained as in the paper, of one ``group`` of trainings: name -> one agent name per seed.
+    """Agent names of policies trained as in the paper: ``PPO`` and ``SAC`` -> one agent name for each seed.
 
-    Empty without ``settings.full``.
+    ``group``: group of trainings. Empty unless ``settings.full``; without algorithms that have unfinished trainings.
     """
     runs = finished_runs(settings.folder, group) if settings.full else {}
     return {
@@ -128,47 +133,50 @@ LearningCurves = Sequence[
 
 
 class Course(NamedTuple):
-    """Learning curves of one recipe at one delay, for each seed, over the progress of the training (%)."""
+    """Learning curves of one recipe at one delay, for all seeds, over the progress of the training (0 to 100 %)."""
 
     returns: LearningCurves  # mean return of training episodes
-    harm: LearningCurves  # first-impact harm on the fixed list (m2/s2)
-    decisions: float = 100.0  # at the end
+    harm: LearningCurves  # first-impact harm in a fixed list of worlds (m2/s2)
+    decisions: float = 100.0  # of the whole training
 
     @property
     def values(self) -> Floats:
-        """Returns of the training episodes, [seeds, k], at k values of the progress."""
+        """Mean returns of training episodes, [seeds, k], at k values of the progress."""
         return np.array([[*curve.values()] for curve in self.returns])
 
     @property
     def late(self) -> Floats:
-        """Returns in the last quarter of the progress, [seeds, at least 2]."""
+        """Returns in the last quarter of the training, [seeds, at least 2]."""
         return self.values[:, -max(self.values.shape[1] // 4, 2) :]
 
     @property
     def last(self) -> Floats:
-        """Mean return in the last tenth of the progress, [seeds]."""
+        """Mean return over the last tenth of the training, [seeds]."""
         return np.asarray(self.values[:, -max(self.values.shape[1] // 10, 1) :].mean(axis=1))
 
     @property
     def rise(self) -> Floats:
-        """Increase of the return from the first value to the last ones, [seeds]."""
+        """Increase of the return from its first value to ``last``, [seeds]."""
         return np.asarray(self.last - self.values[:, 0])
 
     @property
     def converged(self) -> Floats:
-        """Number of decisions until the return has made nine tenths of its rise, [seeds]; all if it does not rise."""
+        """Number of decisions until the return has made nine tenths of its ``rise``, [seeds].
+
+        If the return of a seed does not rise: all decisions of the training.
+        """
         risen = self.values >= (self.values[:, 0] + RISEN * self.rise)[:, np.newaxis]
         progress = np.where(self.rise > 0.0, np.array([*self.returns[0]])[risen.argmax(axis=1)], 100.0)
         return 0.01 * self.decisions * progress
 
     @property
     def unrest(self) -> Floats:
-        """Standard deviation of the return in the last quarter of the progress, [seeds]."""
+        """Standard deviation of the return over the last quarter of the training, [seeds]."""
         return np.asarray(self.late.std(axis=1, ddof=1))
 
     @property
     def spread(self) -> Floats:
-        """Mean distance of the return from the mean over all seeds, in the last quarter of the progress, [seeds]."""
+        """Mean distance of a seed's return from the mean of all seeds, in the last quarter of the training, [seeds]."""
         return np.asarray(np.abs(self.late - self.late.mean(axis=0)).mean(axis=1))
 
 
@@ -194,6 +202,10 @@ def courses_of(settings: ReproductionSettings, delay: str) -> dict[str, Course]:
 
 
 def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
+    """Fig. 2 or 3: learning curves at a high or low ``delay``, and the paper's statements about them.
+
+    Without finished trainings at both delays, the verdict on these statements is "not run".
+    """
     courses = {level: courses_of(settings, level) for level in (HIGH, LOW)}
     if not all(name in courses[level] for level in courses for name in NAMES.values()):
         why = "needs trainings at both delays; --full does them"
@@ -239,6 +251,10 @@ STATEMENTS = {
 
 
 def judge_courses(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Claim]:
+    """Verdicts on the paper's statements about the learning curves at a high or low ``delay``.
+
+    ``courses``: delay -> algorithm -> learning curves.
+    """
     high, low = courses[HIGH], courses[LOW]
     if delay == HIGH:
         last_difference = np.abs(high["PPO"].last - high["SAC"].last) - ALIKE * high["PPO"].rise
@@ -259,10 +275,10 @@ def judge_courses(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> li
 
 
 def convergence_claim(courses: Mapping[str, Course], by_decisions: Claim) -> Claim:
-    """Claim that SAC converges faster, as undecided.
+    """Verdict on the statement that SAC converges faster than PPO: always "undecided".
 
-    The paper's axis is the progress of trainings of unknown length. ``courses``: name -> learning curves.
-    ``by_decisions``: the claim, judged by the number of decisions.
+    The paper's axis is the progress (%) of trainings whose lengths it does not state. ``courses``: algorithm ->
+    learning curves. ``by_decisions``: the verdict if convergence is counted in decisions.
     """
     ends = {name: (course.converged.mean(), course.decisions) for name, course in courses.items()}
     text = ", ".join(f"{name} after {at:,.0f} of {total:,.0f} decisions" for name, (at, total) in ends.items())

@@ -1,4 +1,4 @@
-"""Input and results of an item of a reproduction, which is a figure or a table of the paper."""
+"""Settings and results of an *item* of the reproduction, which is a figure or a table of the paper."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ POLICIES = "PPO and SAC are the shipped policies, trained on paper-random at 0.5
 
 @dataclass(frozen=True)
 class ReproductionSettings:
-    folder: Path  # of all results, and of the trainings
+    folder: Path  # for all results and trainings
     full: bool = False  # train by the paper's own process
     episodes: int = PAPER_EPISODES  # largest number of worlds of an item
     tell: OnProgress = lambda progress: None
@@ -35,14 +35,16 @@ class ReproductionSettings:
 
 
 class DrawnFigure(NamedTuple):
-    stem: str  # of the files' names
+    stem: str  # name of the files without their endings
     title: str
     text: str  # description
     figure: Figure
 
 
 class Made(NamedTuple):
-    claims: Sequence[Claim] = ()  # of the paper
+    """Results of an item."""
+
+    claims: Sequence[Claim] = ()  # claims of the paper with our verdicts
     sheets: Sequence[Sheet] = ()  # tables
     figures: Sequence[DrawnFigure] = ()
     notes: Sequence[str] = ()  # what was run

@@ -7,23 +7,24 @@ command u, from sample n to sample n + 1, is
     v(n + 1) = f(n) + h u(n)
 
 where f(n) is its speed after the impacts of sample n. Where the gap of a pair is at most 0 and its closing speed above
-0, its speeds change by eq. (13). The paper leaves open, and this map resolves:
+0, its speeds change by eq. (13). Where the paper leaves something open, this map chooses:
 
-* Impacts follow each other from the rear pair to the front pair: in the paper f is f1 applied after f3. The harm of the
-  front impact has the speeds that f3 leaves; the paper's J_harm has those before both.
-* The paper's f1 and f3 would also pull vehicles together that overlap and separate. Its text below eq. (13) requires a
-  positive closing speed, and so does this map. As in the exact physics, a touch does no harm.
-* Before the first decision worlds move exactly, and have no impact, as the paper assumes.
+* Impacts at one sample happen from the rear pair to the front pair, because the paper applies f1 after f3. The harm of
+  the front impact follows from the speeds after f3; the paper's J_harm uses the speeds before both impacts.
+* The paper's f1 and f3 would pull overlapping vehicles together even while they separate. The text below eq. (13)
+  requires a positive closing speed, and so does this map. As in the exact physics, a touch (a closing speed of at most
+  1e-5 m/s) does no harm.
+* Until the first decision, worlds follow the exact physics and must have no impact, as the paper assumes.
 * The command of a step is the one in force at its first sample (zero-order hold).
-* ``0 <= v <= v_max`` is a constraint on u in the paper: commands are limited so that the speed keeps it at the next
-  sample. An impact can leave a negative speed, which brakes bring back to 0 with the commanded deceleration, or one
-  above v_max, at which engines do nothing; a coasting vehicle keeps both.
-* A sample is on a vehicle's latency if it is at most 1e-6 of a step before it, because times are rounded.
+* ``0 <= v <= v_max`` is a constraint on u in the paper: commands are limited so that the next sample satisfies it. An
+  impact can leave a negative speed: brakes bring it back to 0 with the commanded deceleration. It can leave a speed
+  above v_max: the engine then has no effect. A coasting vehicle keeps its speed in both cases.
+* Times are rounded, so a latency has elapsed at a sample that is at most 1e-6 of a step before its end.
 
-The term ``collision`` of a reward is then the paper's r_collision at the sample at which the step begins; the overlap
-at an episode's last sample does not count. The term ``risk`` is computed at the sample at which the step ends, and
-``jerk`` from the commands before they are limited, as in the exact physics. Gaps are negative while vehicles overlap;
-nothing pushes them apart. Source: the paper, sections "Optimization Problem" and "MDP formulation".
+With this map, the reward term ``collision`` is the paper's r_collision at the sample at which a step begins; an overlap
+at an episode's last sample does not count. The term ``risk`` is computed at the sample at which the step ends. As in
+the exact physics, ``jerk`` is computed from the commands before they are limited. Gaps are negative while vehicles
+overlap; nothing pushes them apart. Source: the paper, sections "Optimization Problem" and "MDP formulation".
 """
 
 from __future__ import annotations
@@ -65,10 +66,14 @@ EXACT_ALONE = ("push", "drove", "still_moving")  # terms of a reward that the ma
 
 
 def exchange(line: Floats, car: Floats) -> None:
-    """Apply eq. (13) to all pairs that overlap and close, and count the harm, in place. w is the closing speed:
+    """Change the speeds of all pairs that overlap and close, by eq. (13), and count impacts and harm; all in place.
+
+    With the closing speed w = v_{i+1} - v_i:
 
     v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})
     v_{i+1}+ = v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})
+
+    ``line`` and ``car``: arrays of a ``State``.
     """
     speed, gap = line[:, SPEED], line[:, GAP]
     for p in range(speed.shape[1] - 2, 0, -1):
@@ -87,7 +92,7 @@ def exchange(line: Floats, car: Floats) -> None:
 
 
 def sample(state: State, step_s: float) -> State:
-    """Advance the state by one sampling period: impacts, then a step with ``state.wanted`` [n, N + 1] (m/s2)."""
+    """State after one time step: first impacts, then motion under the commands ``state.wanted`` [n, N + 1] (m/s2)."""
     line, clock = state.line.copy(), state.clock.copy()
     exchange(line, state.car)
     now, speed, limit = clock[:, TIME, np.newaxis], line[:, SPEED], state.car[:, LIMIT]
@@ -106,10 +111,11 @@ def sample(state: State, step_s: float) -> State:
 
 
 def paper_collision(params: RewardParams, before: State, step: Step, after: State) -> Floats:
-    """The paper's r_collision: minus ``k_energy w^2`` of every pair that overlaps at the sample, [n].
+    """The paper's reward r_collision, [n]: minus ``k_energy w^2`` for every pair that overlaps at the sample.
 
-    w is the closing speed before the impacts of the sample, the state ``before``; ``step`` and ``after`` are unused. A
-    pair counts at each sample of its overlap, also while it separates: the paper's Gamma asks for the gap alone.
+    w is the closing speed in the state ``before``, before the impacts at the sample; ``step`` and ``after`` are unused.
+    A pair counts at every sample at which it overlaps, even while it separates, because the paper's Gamma depends only
+    on the gap.
     """
     speed, gap = before.line[:, SPEED], before.line[:, GAP]
     closing = np.diff(speed[:, 1:], axis=1)
@@ -119,16 +125,19 @@ def paper_collision(params: RewardParams, before: State, step: Step, after: Stat
 
 
 class PaperMap:
-    """The physics ``paper-map`` (``episode.game.Physics``)."""
+    """The paper's fixed-step map as the physics of a game (``episode.game.Physics``)."""
 
     def check(self, scenario: Scenario) -> None:
-        """Raise an error for an obstacle, and for brakes that build up."""
+        """Raise an error for a scenario that has an obstacle, or brakes that build up."""
         right = "is not known to physics: paper-map; leave one of the two out"
         for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
             require(key not in scenario.sources, (key,), UNSHOWN, right)
 
     def rewarding(self, game: Game) -> Rewarding:
-        """Rewards with the paper's own r_collision. Raises ``InvalidInput`` if they need exact impacts."""
+        """Rewards of the game, with the paper's r_collision as the term ``collision``.
+
+        Raises ``InvalidInput`` for the honest cost, push, driving and motion at the horizon, which need exact impacts.
+        """
         counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
         if game.settings.weights[OF_PASSED:].any() or counted:
             what = f"the term {counted[0]}" if counted else "harm_count honest"
@@ -140,9 +149,10 @@ class PaperMap:
         return game.rewarding._replace(terms=terms)
 
     def first_decision(self, game: Game, alert: State) -> State:
-        """Episodes at the first decision.
+        """State of each episode at its first decision. ``alert``: worlds at the alert.
 
-        Raises ``InvalidInput`` for worlds with an impact before it, and for worlds of a scenario with exact impacts.
+        Raises ``InvalidInput`` if a world has an impact before its first decision, or belongs to a scenario with exact
+        impacts.
         """
         if alert.is_exact:
             raise InvalidInput(
@@ -158,6 +168,10 @@ class PaperMap:
         return state
 
     def follow(self, game: Game, state: State, actions: Floats | None) -> tuple[State, Step]:
+        """State after one time step, and harm, rewards and ends of the step. Episodes that have ended do not change.
+
+        ``actions``: of the L learners, [n, L] in [-1, 1].
+        """
         before, settings = decided(game, state, actions), game.settings
         after, over = sample(before, settings.time_step_s), state.ended
         np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])
@@ -177,7 +191,10 @@ class PaperMap:
 
 
 def decided(game: Game, state: State, actions: Floats | None) -> State:
-    """State with the commands of scripts and learners, as at the beginning of a step of a game."""
+    """State with the commands that scripts and learners choose at the beginning of a time step.
+
+    ``actions``: of the L learners, [n, L]. Raises ``InvalidInput`` unless all are in [-1, 1].
+    """
     learners = game.settings.learners
     proposals = proposal_array(learners, actions, state.n)
     if np.isnan(proposals).any():

@@ -1,6 +1,8 @@
-"""The paper's random test (``Table:Random``) under a reading: collision rate and mean harm of its four strategies.
+"""The paper's random test (``Table:Random``): collision rate and mean harm of its four strategies.
 
-A simulation depends only on some fields of a reading, so readings that share these are simulated once.
+A *reading* is one interpretation of the paper's text: a value for each quantity that the text leaves open
+(``readings``). Readings that share the values on which a simulation depends are simulated once. The paper's *hybrid*
+follows a policy where its harm is at most that of E-V2X-BM, called H*, and E-V2X-BM elsewhere.
 """
 
 from __future__ import annotations
@@ -61,9 +63,10 @@ def outcome_of(last: State) -> RandomOutcome:
 
 
 def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED_SPECS) -> RandomTable:
-    """Table of the paper's random test, with 95 % intervals, under a reading of its text.
+    """The paper's table of the random test under one interpretation (``reading``) of its text, with 95 % intervals.
 
-    ``policies``: agent names of ``SAC`` and ``PPO``. Raises ``InvalidInput`` for the coupled H* in the paper's map.
+    ``policies``: ``SAC`` and ``PPO`` -> agent name. Raises ``InvalidInput`` if the reading needs E-V2X-BM (coupled),
+    which needs exact impacts, in the paper's fixed-step map.
     """
     specs = "", "", policies["SAC"], policies["PPO"]
     outcomes = {row: report_outcome(row, reading, episodes, spec) for row, spec in zip(PAPER_ROWS, specs, strict=True)}
@@ -71,9 +74,9 @@ def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIP
 
 
 def report_outcome(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
-    """Collisions and harm (m2/s2) of each world, [n] each, as a reading of the paper reports them.
+    """Collisions and harm (m2/s2), [n] each, as reported under one interpretation (``reading``) of the paper's text.
 
-    ``row``: strategy (a row of the table). ``spec``: agent name of the policy in a hybrid.
+    ``row``: strategy (a row of the table). ``spec``: name of the agent that is the policy of a hybrid.
     """
     worlds, counted = reading.only(*WORLD_FIELDS), reading.counted
     if row == NON_E:
@@ -94,18 +97,20 @@ def report_outcome(row: str, reading: Reading, episodes: int, spec: str = "") ->
 
 
 def algorithm_1(policy: RandomOutcome, baseline: RandomOutcome, bound: Floats, counted: str = "first") -> RandomOutcome:
-    """Outcome of the policy where its harm is at most ``bound`` (H*, [n] m2/s2), else that of E-V2X-BM.
+    """Outcome of the paper's hybrid: the policy's where its harm is at most ``bound``, elsewhere that of E-V2X-BM.
 
-    ``baseline``: outcome of E-V2X-BM. ``counted``: ``first`` or ``total``, the harm that is compared.
+    ``policy``, ``baseline``: outcomes of the policy and of E-V2X-BM. ``bound``: harm of E-V2X-BM, predicted or
+    simulated, [n] m2/s2. ``counted``: the harm to compare, ``first`` or ``total``.
     """
     follows = policy[counted] <= bound
     return {key: np.where(follows, policy[key], baseline[key]) for key in policy}
 
 
 def reported_values(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
-    """Collisions and harm, [n] each: as they happened, or as they were predicted at the alert.
+    """Collisions and harm (m2/s2) to report, [n] each: as simulated, or as predicted at the alert.
 
-    ``numbers`` says which: ``realised``, ``predicted``, or ``predicted harm, realised collisions``.
+    ``numbers``: ``realised`` (simulated), ``predicted``, or ``predicted harm, realised collisions``. ``collided``,
+    ``harm``: simulated. ``predicted``: predicted harm.
     """
     if numbers == "predicted":
         return predicted > 0.0, predicted
@@ -120,10 +125,11 @@ def open_reading(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]
 
 @cache
 def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: int) -> RandomOutcome:
-    """Simulate full braking of all vehicles or, with ``plans``, Vehicle 2 with the deceleration of E-V2X-BM.
+    """Outcome if all vehicles brake fully or, with ``plans``, Vehicle 2 holds the deceleration that E-V2X-BM plans.
 
-    ``worlds`` and ``plans`` are readings: of the simulated worlds, and of those for which E-V2X-BM plans. After an
-    impact, by ``after_impact``, vehicles brake on, or coast from the next decision on, or the episode ends.
+    ``worlds``: reading that defines the simulated worlds. ``plans``: reading that defines the worlds for which E-V2X-BM
+    plans. ``after_impact``: the vehicles of an impact brake on (``brakes on``) or coast from the next decision on
+    (``coasts``), or the episode ends (``ends``).
     """
     if after_impact != "brakes on" and worlds.step_s is None:
         worlds = worlds._replace(others=(*worlds.others, ("time_step_s", SHORT_STEP_S)))
@@ -145,10 +151,11 @@ def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: i
 
 @cache
 def plan(plans: Reading, episodes: int) -> ConstantDeceleration:
-    """Deceleration that E-V2X-BM chooses under the reading ``plans``, [n], and the harm that it predicts.
+    """Deceleration of Vehicle 2 that E-V2X-BM chooses ([n] m/s2), and the harm that it predicts ([n] m2/s2).
 
-    It uses the paper's closed form, without restitution and time steps. If several decelerations do the same least
-    harm, the reading says which is taken: the smallest, middle or largest.
+    Both follow from the paper's closed form, without restitution and time steps. ``plans``: reading that defines the
+    worlds. If several decelerations have the least harm, its value ``star`` selects the smallest, the middle or the
+    largest.
     """
     latencies = () if plans.plans_as_stated else ("acts_s", "rear_s")
     _, _, alert = open_reading(plans.only("base", "others", "seed", *latencies), episodes)
@@ -168,9 +175,10 @@ def plan(plans: Reading, episodes: int) -> ConstantDeceleration:
 
 @cache
 def drive_all(worlds: Reading, spec: str, counted: str, episodes: int) -> RandomOutcome:
-    """Simulate the agent ``spec`` as Vehicle 2 under the reading ``worlds``; return the outcome.
+    """Outcome of the agent ``spec`` as Vehicle 2. ``worlds``: reading that defines the worlds.
 
-    ``counted``: harm that the agent minimises. There is no warning if it is a policy trained for other worlds.
+    ``counted``: harm that the agent minimises, ``first`` or ``total``. The warning that a policy was trained for other
+    worlds is suppressed.
     """
     scenario, game, alert = open_reading(worlds, episodes)
     with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""A reading of the paper as a value: a choice for each quantity that its text leaves open."""
+"""A *reading*: one interpretation of the paper's text, with a value for each quantity that the text leaves open."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ def field_text(field: str, value: Any) -> str:
 
 
 class Reading(NamedTuple):
-    """A reading of the paper's text: a value for each of the quantities that it leaves open. Defaults are ours."""
+    """One interpretation of the paper's text: a value for each quantity that it leaves open. Defaults are ours."""
 
     base: str = RANDOM  # name of the scenario, of three vehicles
     acts_s: float | None = None  # when Vehicle 2 acts (s since the alert); None: the latency of the scenario
-    rear_s: float | None = None  # when Vehicle 3 brakes (s since the alert); None: the same
-    step_s: float | None = None  # of the paper's map, in which impacts happen at samples; None: exact impacts
+    rear_s: float | None = None  # when Vehicle 3 brakes (s since the alert); None: the latency of the scenario
+    step_s: float | None = None  # time step (s) of the paper's map, with impacts at samples; None: exact impacts
     restitution: float | None = None  # None: the scenario's
     others: tuple[tuple[str, Any], ...] = ()  # other keys of the scenario, and their values
     seed: int = SEED  # of the list of worlds
     counted: Literal["first", "total"] = "first"  # harm of each pair's first impact, or of every impact
-    after_impact: Literal["brakes on", "coasts", "ends"] = "brakes on"  # what a vehicle of Non-E, or its episode does
-    plans_as_stated: bool = False  # E-V2X-BM plans for the latencies of the scenario, whichever are driven
-    star: Literal["low end", "middle", "high end"] = "middle"  # of the decelerations that do equally little harm
-    baseline: ReportedHarm = "realised"  # what is reported of E-V2X-BM: what happens, or what it predicts
-    # what is reported of Algorithm 1: with the pairwise H* what happens, or what it predicts, min(H_RL, H*)
+    after_impact: Literal["brakes on", "coasts", "ends"] = "brakes on"  # what vehicles, or the episode, do under Non-E
+    plans_as_stated: bool = False  # E-V2X-BM plans for the scenario's latencies, not for ``acts_s`` and ``rear_s``
+    star: Literal["low end", "middle", "high end"] = "middle"  # which of the decelerations with the least harm
+    baseline: ReportedHarm = "realised"  # what to report of E-V2X-BM: simulation or prediction
+    # what to report of the hybrid (Algorithm 1, with the pairwise H*): simulation, or the prediction min(H_RL, H*)
     hybrid: ReportedHarm | Literal["realised, by the coupled H*", "policy alone"] = "realised"
 
     @property
@@ -60,10 +60,11 @@ class Reading(NamedTuple):
         return "; ".join(field_text(field, getattr(self, field)) for field in changed) or "as stated"
 
     def only(self, *fields: str) -> Reading:
-        """Copy with only these fields; all others have their default values."""
+        """Copy of the reading that keeps the values of ``fields``; all other fields have their defaults."""
         return Reading(**{field: getattr(self, field) for field in fields})
 
     def scenario(self, name: str) -> Scenario:
+        """Shipped scenario ``name`` with this reading's latencies, physics, restitution and other keys."""
         scenario = load_scenario(name)
         keys = dict(self.others)
         latency_s = [*scenario.model_dump()["latency_s"]]

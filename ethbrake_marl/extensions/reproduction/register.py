@@ -1,4 +1,4 @@
-"""The register: what the paper leaves open, our default, and the results of the random test with another value."""
+"""The register: each quantity that the paper leaves open, our default, and the random test with other values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PRINTED = np.array([(row.collision_rate, row.average_harm) for row in RANDOM_TES
 
 
 class Gap(NamedTuple):
-    """A quantity that the paper does not state, or not clearly."""
+    """A gap in the paper's text: a quantity that it does not state, or not clearly."""
 
     name: str
     paper: str  # what it says, with the label in its source
@@ -92,16 +92,20 @@ COMBINED = Gap("several at once", "", "", (
 
 
 def rates_and_harms(table: RandomTable) -> Floats:
-    """Collision rate and mean harm of the four rows, [4, 2]; the other printed numbers follow from them."""
+    """Collision rate and mean harm (m2/s2) of the table's four strategies, [4, 2].
+
+    The other numbers that the paper prints follow from these.
+    """
     return np.array([[number.value for number in row] for row in table.values()])
 
 
 def distance(numbers: Floats, printed: Floats = PRINTED) -> float:
-    """Root mean square of the relative differences of a table's eight numbers, ours / printed - 1."""
+    """Distance of our table from the printed one: root mean square of ``numbers / printed - 1``, both [4, 2]."""
     return float(np.sqrt(np.square(numbers / printed - 1.0).mean()))
 
 
 def reproduce_gaps(settings: ReproductionSettings) -> Made:
+    """Table of the quantities that the paper leaves open, and table of the random test with every alternative value."""
     episodes = min(REGISTER_WORLDS, settings.episodes)
     cases = [(DEFAULTS, STATED), *((gap, reading) for gap in (*GAPS, COMBINED) for reading in gap.alternatives)]
     rows = []

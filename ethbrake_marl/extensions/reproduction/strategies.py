@@ -1,4 +1,7 @@
-"""What each strategy does under a reading: the paper's four, ours for comparison, and the paper's own process."""
+"""Collisions and harm of each strategy: the paper's four, ours for comparison, and policies trained as in the paper.
+
+A *reading* is one interpretation of the paper's text (``readings``).
+"""
 
 from __future__ import annotations
 
@@ -26,15 +29,15 @@ from ethbrake_marl.motion.layout import Floats
 
 COUPLED, SIMULATED = "E-V2X-BM (coupled)", "simulated H*"
 PAPERS = "paper's process"
-PREDICTED = "predicted"  # key of an outcome: harm that is expected at the alert, [n] m2/s2
+PREDICTED = "predicted"  # key of an outcome: harm predicted at the alert, [n] m2/s2
 MAP_STEP_S = 0.1
 
 
 def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, RandomOutcome]:
-    """Outcome of each strategy under a reading of the paper: name -> outcome.
+    """Outcome of each strategy under one interpretation (``reading``) of the paper's text: name -> outcome.
 
-    If impacts are exact, E-V2X-BM (coupled) and its hybrids are included. ``policies``: name -> agent name. Hybrids
-    decide by first-impact harm.
+    ``policies``: name -> agent name. Every policy also has a hybrid (``algorithm_1``), which compares first-impact
+    harm. If impacts are exact, E-V2X-BM (coupled) and its hybrids are included.
     """
     worlds, plans = reading.only(*WORLD_FIELDS), reading.only(*PLANS)
     baseline = {**brake(worlds, plans, "brakes on", episodes), PREDICTED: plan(plans, episodes).harm}
@@ -55,9 +58,10 @@ def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> 
 def of_the_process(
     reading: Reading, episodes: int, settings: ReproductionSettings
 ) -> dict[str, list[dict[str, RandomOutcome]]]:
-    """Outcomes of policies trained as in the paper, alone and in the hybrid, in the paper's fixed-step map.
+    """Outcomes in the paper's fixed-step map with policies trained as in the paper.
 
-    Policy -> for each seed, strategy -> outcome. Empty without such trainings.
+    Policy -> for each seed, strategy -> outcome. The strategies are those of ``strategies`` with this one policy. Empty
+    if there are no such trainings.
     """
     mapped = reading._replace(step_s=MAP_STEP_S)
     return {
@@ -67,6 +71,6 @@ def of_the_process(
 
 
 def proven_least_harm(reading: Reading, episodes: int) -> Floats:
-    """Proven lower bound on the harm of every strategy under exact impacts, [n] m2/s2."""
+    """Proven lower bound on the harm of every strategy in the worlds of ``reading``, for exact impacts, [n] m2/s2."""
     scenario, _, alert = open_reading(reading.only(*WORLD_FIELDS), episodes)
     return lower_bound(alert, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s).harm

@@ -1,4 +1,4 @@
-"""The paper's tables (``Table:hybrid``, ``Table:Random``) and its two contributions, as numbers and conclusions."""
+"""Compare the paper's tables (``Table:hybrid``, ``Table:Random``) and its two contributions with our results."""
 
 from __future__ import annotations
 
@@ -77,10 +77,11 @@ def number_claims(
     *,
     not_ours: bool = False,
 ) -> list[Claim]:
-    """Every number that the paper prints in a table as a claim, compared with ours.
+    """Verdict on every number that the paper prints in a table.
 
-    ``stated``, ``nearest``: our outcomes under the paper's parameters as stated, and in the reading nearest to its
-    results. ``least`` [n] m2/s2: proven lower bound, as stated. ``not_ours``: the policies are the user's.
+    ``stated``, ``nearest``: our outcomes with the paper's parameters as stated, and under the interpretation of the
+    paper whose results come nearest to the printed ones. ``least``: proven lower bound on the harm with the parameters
+    as stated, [n] m2/s2. ``not_ours``: the policies are the user's.
     """
     claims, proven = [], {RATE: rate(least > 0.0), AVERAGE: mean(least)}
     for row in printed:
@@ -123,9 +124,9 @@ def number_claims(
 
 
 def outcomes_sheet(title: str, outcomes: Mapping[str, RandomOutcome], least: Floats) -> Sheet:
-    """Table of collision rates and harm. ``outcomes``: strategy -> outcome.
+    """Table of collision rate and mean harm of each strategy, and of the proven lower bound.
 
-    ``least`` [n] m2/s2: proven lower bound.
+    ``outcomes``: strategy -> outcome. ``least``: proven lower bound on the harm, [n] m2/s2.
     """
     rows = [
         (
@@ -142,9 +143,9 @@ TABLE_COLUMNS = PERCENT, *map(Column, ("First-impact harm", "Total harm", "Predi
 
 
 def process_sheet(settings: ReproductionSettings, reading: Reading, episodes: int) -> list[Sheet]:
-    """Table of policies trained as in the paper, in its fixed-step map: means over seeds with t intervals.
+    """Table of policies trained as in the paper, in its fixed-step map: means over seeds, with t intervals.
 
-    Empty without such trainings.
+    The list has this table, or is empty if there are no such trainings.
     """
     outcomes = of_the_process(reading, episodes, settings)
     if not outcomes:
@@ -180,10 +181,10 @@ def compare_collisions(outcomes: Mapping[str, RandomOutcome], smaller: str, *lar
 def compare_over_seeds(
     process: Mapping[str, Sequence[Mapping[str, RandomOutcome]]], smaller: str, larger: str
 ) -> list[Less]:
-    """Compare the harm and collisions of two strategies over the seeds of policies trained as in the paper.
+    """Comparisons of harm and collision rate between two strategies, over seeds of policies trained as in the paper.
 
-    ``process``: policy -> for each seed, strategy -> outcome. ``{}`` in the strategies' names ``smaller`` and
-    ``larger`` stands for the policy's name.
+    ``process``: policy -> for each seed, strategy -> outcome. ``smaller``, ``larger``: names of the two strategies,
+    with ``{}`` in place of the policy's name.
     """
     parts = []
     for name, seeds in process.items():
@@ -197,9 +198,9 @@ def compare_over_seeds(
 
 
 def conclusions(outcomes: Mapping[str, RandomOutcome], policies: Iterable[str]) -> dict[str, list[Less]]:
-    """The paper's conclusions from its table: statement -> the comparisons that must hold.
+    """The paper's conclusions from its table: statement -> comparisons that must all hold.
 
-    ``outcomes``: strategy -> outcome.
+    ``outcomes``: strategy -> outcome. ``policies``: names of the learned policies.
     """
     hybrids = [f"Hybrid {name}" for name in policies]
     baselines = [name for name in (E_V2X_BM, COUPLED) if name in outcomes]
@@ -232,6 +233,7 @@ def conclusions(outcomes: Mapping[str, RandomOutcome], policies: Iterable[str]) 
 
 
 def reproduce_random_table(settings: ReproductionSettings) -> Made:
+    """Table III (``Table:Random``): verdicts on its numbers, the conclusions from it and the paper's contributions."""
     episodes, policies = settings.episodes, settings.policies
     least = proven_least_harm(STATED, episodes)
     rows = {E_V2X_BM: "", NON_E: "", **{f"Hybrid {name}": spec for name, spec in policies.items()}}
@@ -261,6 +263,7 @@ def reproduce_random_table(settings: ReproductionSettings) -> Made:
 
 
 def reproduce_hybrid_table(settings: ReproductionSettings) -> Made:
+    """Table II (``Table:hybrid``): verdicts on its numbers and conclusions, with our policy that has not converged."""
     episodes, spec = min(STOPPED_WORLDS, settings.episodes), unconverged(settings.folder)
     least = proven_least_harm(STATED, episodes)
 

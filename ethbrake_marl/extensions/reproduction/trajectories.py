@@ -39,9 +39,9 @@ def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Recor
 
 @in_our_style
 def road_figure(records: Records, caption: str) -> Figure:
-    """Draw the vehicles along the road in four episodes, one row for each vehicle, with an arrow every second.
+    """Draw the positions of the vehicles along the road in four episodes, one panel each, with an arrow every second.
 
-    ``records``: (policy, scenario number) -> episode. Dashed lines join equal times.
+    Dashed lines join the vehicles at the same time. ``records``: (policy, scenario number) -> episode.
     """
     figure, panels = new_panels((10.0, 4.8), 2, 2, sharex=True, sharey=True)
     for axes, ((name, number), record) in zip(panels, records.items(), strict=True):
@@ -59,6 +59,10 @@ def road_figure(records: Records, caption: str) -> Figure:
 
 @in_our_style
 def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
+    """Draw the commands of Vehicle 2 over time: one panel for each policy and scenario, with a curve for each reading.
+
+    ``curves``: reading (interpretation of the paper's text) -> (policy, scenario number) -> episode.
+    """
     figure, all_axes = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
     for axes, key in zip(all_axes, next(iter(curves.values())), strict=True):
         axes.axhline(0.0, color=GREY, linewidth=0.8)
@@ -73,10 +77,10 @@ def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
 
 
 def all_records(settings: ReproductionSettings) -> dict[str, Records]:
-    """Recorded episodes under the paper's parameters as stated, and in the reading nearest to its results.
+    """Recorded episodes, reading -> (policy, scenario number) -> episode.
 
-    Reading -> (policy, scenario number) -> episode. After trainings by the paper's own recipes, also the episodes of
-    their first seed.
+    Two readings: the paper's parameters as stated, and the interpretation of the paper whose results come nearest to
+    its own. After training by the paper's own recipes, also ``paper's process``: the first seed of each policy.
     """
     policies = tuple(settings.policies.items())
     records = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
@@ -85,6 +89,7 @@ def all_records(settings: ReproductionSettings) -> dict[str, Records]:
 
 
 def reproduce_trajectories(settings: ReproductionSettings) -> Made:
+    """Fig. 6: positions in Scenarios 1 and 2 under PPO and SAC, and the paper's statements about them."""
     readings, parts = all_records(settings), []
     figures = []
     for number, (name, records) in enumerate(readings.items(), 1):
@@ -126,6 +131,7 @@ def reproduce_trajectories(settings: ReproductionSettings) -> Made:
 
 
 def reproduce_accelerations(settings: ReproductionSettings) -> Made:
+    """Fig. 7: commands of Vehicle 2 in Scenarios 1 and 2 under PPO and SAC, and the paper's statements about them."""
     readings, parts = all_records(settings), []
     text = "Command of Vehicle 2 over time, as the paper states the latencies and under other readings."
     figure = DrawnFigure("accelerations", "Acceleration profiles", text, profiles_figure(readings, text))
@@ -168,10 +174,10 @@ def reproduce_accelerations(settings: ReproductionSettings) -> Made:
 
 
 def resample_pair(records: Records, number: int, what: str, column: int) -> list[Floats]:
-    """Recorded quantity under PPO, and under SAC at the same times; a finished episode keeps its last value.
+    """A recorded quantity under PPO and under SAC, [k] each, at the same k times.
 
-    ``number``: the paper's Scenario 1 or 2. ``what``: attribute of ``EpisodeRecord``. ``column``: vehicle or pair, from
-    0.
+    ``number``: of the paper's scenario, 1 or 2. ``what``: attribute of ``EpisodeRecord``. ``column``: vehicle or pair,
+    from 0. After an episode has ended, its last value is repeated.
     """
     pair = [records[name, number] for name in ("PPO", "SAC")]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
@@ -179,18 +185,18 @@ def resample_pair(records: Records, number: int, what: str, column: int) -> list
 
 
 def policy_difference(records: Records, number: int, what: str) -> float:
-    """Root mean square over time of the difference between PPO and SAC, for Vehicle 2.
+    """Root mean square over time of the difference between PPO and SAC in a recorded quantity of Vehicle 2.
 
-    ``number``: the paper's Scenario 1 or 2. ``what``: attribute of ``EpisodeRecord``.
+    ``number``: of the paper's scenario, 1 or 2. ``what``: attribute of ``EpisodeRecord``.
     """
     ppo, sac = resample_pair(records, number, what, VEHICLE_2_COLUMN)
     return float(np.sqrt(np.mean((ppo - sac) * (ppo - sac))))
 
 
 def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[Claim]:
-    """Claims that one quantity is smaller than another in a world, as stated and in the nearest reading.
+    """Verdicts on claims that one quantity is smaller than another in a single world.
 
-    ``readings``: for both, claim -> words, (smaller quantity) - (larger one).
+    ``readings``: as stated, then in the nearest reading: claim -> numbers in words, smaller quantity minus larger one.
     """
     claims = []
     for text in readings[0]:
@@ -205,9 +211,9 @@ def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[
 
 
 def profile_of(record: EpisodeRecord) -> tuple[float, float, float]:
-    """First command of Vehicle 2, the sum of its changes (m/s2), and the share of time in which it brakes.
+    """First command of Vehicle 2 (m/s2), sum of the absolute changes of its command (m/s2), and share of braking.
 
-    The share is of the time in which it moves after its latency.
+    All after its latency. The share is the fraction of the time in motion in which it brakes.
     """
     acting = record.time_s >= float(record.initial.latency_s[0, VEHICLE_2_COLUMN])
     command, moving = record.command_mps2[acting, VEHICLE_2_COLUMN], record.speeds_mps[acting, VEHICLE_2_COLUMN] > 0.0

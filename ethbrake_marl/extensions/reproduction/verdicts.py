@@ -1,14 +1,18 @@
-"""The one table of the reproduction: a claim of the paper, ours as stated, ours in the nearest reading, and why.
+"""Verdicts on the claims of the paper, and the table that lists them.
 
-The *chance difference* is the largest difference between means of two random lists of worlds that is due to chance
-alone (95 %): sqrt(2) times half of the interval. A printed number
-- *agrees* if ours is within 2 % of it;
-- is *undecided* if ours is within the chance difference of it: too few worlds;
-- *cannot be* if a lower bound that is proven for every strategy is above it by more than the chance difference;
+Its columns are: a claim of the paper, our result with the parameters as stated, our result in the *nearest reading*
+(the interpretation of the paper that comes nearest to its numbers), and the verdict with a reason.
+
+The *chance difference* is the largest difference (95 %) that chance alone causes between the means of two random lists
+of worlds: sqrt(2) times half the width of the 95 % interval. The verdict on a printed number is the first that applies:
+
+- *cannot be* if a proven lower bound for every strategy is above it by more than the chance difference;
+- *agrees* if our number is within 2 % of it;
+- *undecided* if our number is within the chance difference of it: too few worlds;
 - *differs* otherwise.
 
-A statement of the paper says that quantities are smaller than others. It agrees if the interval of every difference
-(smaller minus larger) is below 0, and is undecided if the others contain 0.
+A statement of the paper says that some quantities are smaller than others. It *agrees* if the interval of every
+difference (smaller minus larger) is below 0, is *undecided* if the remaining intervals contain 0, and else *differs*.
 """
 
 from __future__ import annotations
@@ -30,11 +34,13 @@ DIFFERENCE = Column("Difference", sign="+")
 
 
 class Claim(NamedTuple):
-    where: str  # in the paper
-    paper: str  # what it says
-    ours: str  # as the paper states its parameters
-    nearest: str  # in the nearest reading
-    outcome: Verdict  # as stated
+    """A number or statement of the paper, our results, and our verdict."""
+
+    where: str  # place in the paper
+    paper: str  # what the paper says
+    ours: str  # our result with the parameters as stated
+    nearest: str  # our result in the nearest reading
+    outcome: Verdict  # on our result as stated
     why: str
 
     @property
@@ -55,9 +61,9 @@ def chance_difference(ours: Estimate) -> float:
 
 
 def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) -> Verdict:
-    """Compare a printed number (not 0) with ours; the outcomes are explained in the module.
+    """Verdict on a printed number (not 0) by the rules of this module.
 
-    ``least``: proven lower bound for all strategies.
+    ``ours``: our number. ``least``: proven lower bound for all strategies.
     """
     if least is not None and least.value - printed > chance_difference(least):
         return "cannot be"
@@ -67,8 +73,10 @@ def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) 
 
 
 class Less(NamedTuple):
+    """Comparison of two quantities, the first of which is smaller according to the paper."""
+
     where: str
-    difference: Estimate  # what should be smaller, minus the other
+    difference: Estimate  # quantity that should be smaller, minus the larger one
     both_are_0: bool = False  # in every world: nothing can be smaller
 
     @classmethod
@@ -85,10 +93,10 @@ class Less(NamedTuple):
 
 
 def judge_statement(parts: Sequence[Less], show: Column = DIFFERENCE) -> tuple[str, Verdict, str]:
-    """Judge a statement of the paper, that some quantities are smaller than others.
+    """Result in words, verdict and details in words, for a statement that some quantities are smaller than others.
 
-    Return in how many comparisons (``parts``) it holds, the outcome, and the comparisons that fail or, if none does,
-    the closest one. ``show``: how their numbers are written.
+    The result says in how many of the comparisons ``parts`` the statement holds. The details are the differences of the
+    comparisons that fail or, if none fails, of the closest one. ``show``: format of these numbers.
     """
     compared = [part for part in parts if not part.both_are_0]
     failing = [part for part in compared if not part.holds]
@@ -113,9 +121,11 @@ def judge(
     why: str = "",
     show: Column = DIFFERENCE,
 ) -> Claim:
-    """Compare a statement of the paper with our results as stated and in the nearest reading.
+    """Claim with our verdict on a statement of the paper.
 
-    ``where`` and ``paper``: place and words of the statement. ``why``: the reason to show if they differ.
+    ``where``, ``paper``: place and words of the statement. ``stated``, ``nearest``: comparisons with the parameters as
+    stated, and in the nearest reading. ``why``: reason to show if the verdict is "differs". ``show``: format of
+    numbers.
     """
     ours, outcome, numbers = judge_statement(stated, show)
     nearest_result = judge_statement(nearest, show)[0] if nearest else ""

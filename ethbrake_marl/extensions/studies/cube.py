@@ -18,11 +18,13 @@ _TRIAL_WORLDS = 16  # random worlds in which the effect of a number is looked fo
 
 
 class Cube(NamedTuple):
+    """Unit cube of a scenario. ``places``: the random number (stream and column) that each coordinate sets."""
+
     scenario: Scenario
     places: tuple[Place, ...]
 
     def worlds(self, points: Floats) -> State:
-        """Worlds at ``points`` [n, d] of [0, 1)."""
+        """Worlds at the alert for ``points`` of the cube, [n, d] in [0, 1)."""
         index = np.arange(len(points), dtype=np.int64)
 
         def numbers(width: int, stream: tuple[int, ...]) -> Floats:
@@ -35,17 +37,17 @@ class Cube(NamedTuple):
         return draw_once(self.scenario, numbers, index).worlds
 
     def accepts(self, worlds: State) -> Bools:
-        """Whether the scenario accepts the worlds, [n]. Some scenarios reject worlds with an early impact."""
+        """Whether the scenario accepts a world, [n]; it may reject worlds with an impact before a learner can act."""
         if self.scenario.early_impacts == "keep" or not self.scenario.learners:
             return np.ones(worlds.n, np.bool_)
         return ~has_early_impact(self.scenario, worlds)
 
 
 def cube_of(scenario: Scenario) -> Cube:
-    """Coordinates of a scenario: all random numbers whose change changes a world.
+    """Unit cube of a scenario, with one coordinate for every random number that can change a world.
 
-    Raises ``InvalidInput`` if nothing is random, for a mixture of scenarios, and for a channel with random delays or
-    losses, which a table of worlds cannot store.
+    Raises ``InvalidInput`` if nothing is random, for a mixture of scenarios, and for a V2X channel with random delays
+    or losses, which a table of worlds cannot store.
     """
     if scenario.members:
         members = ", ".join(member.name for member in scenario.members)

@@ -23,13 +23,13 @@ _LAST = np.nextafter(1.0, 0.0)
 def search_cube(
     score: Score, dimensions: int, budget: int, seed: int, on_round: Callable[[int], None]
 ) -> tuple[Floats, Floats]:
-    """Search the unit cube for points with a high score; return all tried points, [budget, d], and their scores.
+    """Points that a search of the unit cube for high scores tries, [budget, d], and their scores [budget].
 
-    Points are tried in rounds. Half of a round is spread evenly over the cube (scrambled Sobol points). Each other
-    point is one step away from a *parent*, one of the best points so far that are not close to each other. The step is
-    normally distributed in some coordinates, or half the difference between two random parents (differential
-    evolution). While no score is above the median, all points are spread evenly. ``on_round`` gets the number of points
-    tried so far.
+    Points are tried in rounds. Half of a round is spread evenly over the cube (scrambled Sobol points). Every point of
+    the other half is one step away from a *parent*: parents are the best points so far that are not close to each
+    other. A step is normally distributed in some coordinates, or half the difference between two random parents
+    (differential evolution). While no score is above the median, all points are spread evenly. ``on_round``: called
+    with the number of points tried so far.
     """
     rng, spread = np.random.default_rng([seed, dimensions]), _spread(dimensions, seed)
     points, scores = np.empty((0, dimensions)), np.empty(0)
@@ -54,9 +54,9 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 
 
 def far_apart(points: Floats, scores: Floats, count: int) -> Ints:
-    """At most ``count`` rows of ``points`` [m, d] with high finite ``scores`` [m], highest first.
+    """Rows of at most ``count`` of the ``points`` [m, d] with high finite ``scores`` [m], highest score first.
 
-    Any two of the points differ by at least ``LEAST_DISTANCE`` in some coordinate.
+    Any two of these points differ by at least ``LEAST_DISTANCE`` in some coordinate.
     """
     order = np.argsort(-scores, kind="stable")
     order = order[np.isfinite(scores[order])]
@@ -68,6 +68,7 @@ def far_apart(points: Floats, scores: Floats, count: int) -> Ints:
 
 
 def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
+    """New points of the cube, [count, d], one step (``search_cube``) away from ``parents`` [p, d]."""
     if count == 0:
         return parents[:0]
     parent = parents[np.arange(count) % len(parents)]

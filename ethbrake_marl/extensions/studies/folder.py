@@ -19,14 +19,14 @@ def work_in(
 ) -> Iterator[None]:
     """Context manager that creates a study's folder, and locks it against other processes.
 
-    After an interruption, the same command continues the work in this folder; unfinished files of killed processes are
+    After an interruption, the same command continues the study in this folder; unfinished files of killed processes are
     removed first.
 
     Args:
         folder: created if necessary.
-        kind: what it contains, in words for messages, such as ``an ablation``.
+        kind: what the folder contains, in words for messages, such as ``an ablation``.
         settings: all settings and software versions on which the results depend, as plain data.
-        record: name of the file that stores them.
+        record: name of the file that stores ``settings``.
         advice: end of error messages, which says what the user can do.
         writes: names of the files that the study will overwrite.
 

@@ -19,35 +19,36 @@ from ethbrake_marl.worlds.describe import fixed_columns, quantities_of
 from ethbrake_marl.worlds.scenario import Scenario
 
 WEAKNESS_MEASURES = ("harm", "regret", "bound")
-HINDSIGHT = "best_harm"  # with what regret compares by default
+HINDSIGHT = "best_harm"  # default rival of regret
 
 
 class WeaknessResult(NamedTuple):
     score: Floats  # [n] value of the measure, the larger the worse for the agent
     harm: Floats  # [n] harm of the agent
-    reference: Floats | None  # [n] harm of the other agent, or bound of the agent's shield; None for ``harm``
+    reference: Floats | None  # [n] harm of the rival, or bound of the agent's shield; None for ``harm``
 
 
 class WeaknessMeasure(NamedTuple):
-    """Measure of how badly an agent does in a world.
+    """Measure of how badly an agent does in a world (m2/s2).
 
-    ``harm``: the agent's harm. ``regret``: its harm minus that of another agent, by default the best known harm.
-    ``bound``: its harm minus the bound of its shield at the alert; above 0 the bound is broken.
+    ``harm``: the agent's harm. ``regret``: the agent's harm minus the harm of a rival, by default the best known
+    commands. ``bound``: the agent's harm minus the bound that its shield promises at the alert; above 0 the bound is
+    broken.
     """
 
     name: str
     scenario: Scenario
     game: Game
-    teams: tuple[Team, ...]  # the agent, then the other one if there is one
-    harm_count: str  # (``episode.counts``)
+    teams: tuple[Team, ...]  # the agent, then the rival if there is one
+    harm_count: str  # name of the count of harm (``episode.counts``)
 
     @classmethod
     def of(cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: str = "first") -> WeaknessMeasure:
-        """Measure ``name`` of ``agent``.
+        """Measure called ``name`` of an agent.
 
-        ``against``: the other agent; None: none, or the best known commands. Agents are names or objects, as for
-        ``eb.evaluate``. Raises ``InvalidInput`` if ``against`` is not used, or a name means several agents, and the
-        errors of ``teams_of``.
+        ``against``: the rival, for ``regret`` only; None: the best known commands. Agents are names or objects, as for
+        ``eb.evaluate``. Raises ``InvalidInput`` for an unknown measure, if ``against`` has no effect, and if a name
+        means several agents; and the errors of ``teams_of``.
         """
         if name not in WEAKNESS_MEASURES:
             raise unknown_name("measure", name, WEAKNESS_MEASURES)
@@ -62,7 +63,10 @@ class WeaknessMeasure(NamedTuple):
         return cls(name, loaded, game, sum(teams, ()), harm_count)
 
     def __call__(self, worlds: State) -> WeaknessResult:
-        """Measure in some worlds. Raises ``InvalidInput`` for ``bound`` without a shield."""
+        """Value of the measure in every world.
+
+        Raises ``InvalidInput`` for ``bound`` if the agent has no shield that promises a bound.
+        """
         last, *rival_states = (play_to_end(self.game, worlds, team) for team in self.teams)
         harm = last.harm(self.harm_count)
         if self.name == "harm":
@@ -79,11 +83,12 @@ class WeaknessMeasure(NamedTuple):
     def falsify(
         self, budget: int, seed: int, *, most: int = 20, on_round: Callable[[int], None] | None = None
     ) -> tuple[State, WeaknessResult, Floats]:
-        """Search all worlds that the scenario can draw for those in which the agent does worst.
+        """Worst worlds for the agent among ``budget`` worlds that a search of the scenario tries.
 
-        Returns the at most ``most`` worst worlds at the alert, worst first, the measure in them, and the scores of all
-        tried worlds [budget] (m2/s2; minus infinity: the scenario rejects the world). Except for ``bound``, only worlds
-        with a score above 0 are returned, perhaps none. Any two of the worlds differ clearly.
+        Returns at most ``most`` worlds at the alert, worst first; the measure in them; and the scores of all tried
+        worlds, [budget] m2/s2 (minus infinity: the scenario rejects the world). Except for ``bound``, only worlds with
+        a score above 0 are returned, perhaps none. Any two of the worlds differ clearly. ``on_round``: called with the
+        number of worlds tried so far.
 
         Raises the errors of ``cube_of``, and ``InvalidInput`` if the scenario rejects every tried world.
         """
@@ -109,7 +114,7 @@ class WeaknessMeasure(NamedTuple):
 
 
 def states_of(worlds: State, scenario: Scenario) -> list[dict[str, float]]:
-    """Each world's initial state: gaps, speeds, and what the scenario does not fix, by name of the column."""
+    """Initial state of each world, column -> value: gaps, speeds, and what else the scenario does not fix."""
     fixed = fixed_columns(scenario)
     columns = {name: values for name, values in quantities_of(worlds).items() if name not in fixed}
     return [
