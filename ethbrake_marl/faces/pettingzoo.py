@@ -131,7 +131,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     ) -> tuple[dict[str, Observations], Infos]:
         """Start an episode in the first world of ``seed``, or without a seed in the next world.
 
-        Options: ``{"initial_state": ...}``, or ``{"listed_world": {"seed": 7, "number": 3}}`` of an evaluation list.
+        Options choose another world: ``{"initial_state": {"gaps_m": [7, 7], ...}}``, or a world of an evaluation list,
+        ``{"listed_world": {"seed": 7, "number": 3}}``.
         """
         stream, state = self.stream.reset(1, None if seed is None else chosen_seed(seed), options)
         answer = self._observations(state), self._by_agent(self._infos(stream, state, None))
@@ -161,7 +162,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return state_vector
 
     def _columns(self, actions: Mapping[str, Any]) -> Floats:
-        """Actions of the learners, [1, L]. With a shield an action may be missing: NaN."""
+        """Actions of the learners, [1, L]; NaN for a missing action, which is allowed only with a shield."""
         if not isinstance(actions, Mapping):
             raise InvalidInput(
                 f"step: actions = {actions!r}: must be a mapping from agent to action, such as {{'vehicle_2': [-1.0]}}"
@@ -191,7 +192,7 @@ parallel_env = EthBrakeParallelEnv
 
 
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> Any:
-    """Environment in PettingZoo's AEC form (agents act in turns, front to rear), made by ``parallel_env``.
+    """Environment in PettingZoo's AEC form (agents act in turns, front to rear), with arguments of ``parallel_env``.
 
     A bad action is refused at the turn of the last agent.
 
