@@ -35,10 +35,10 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
     """Constant deceleration of vehicle ``body`` that does the least simulated harm, and this harm, in every world.
 
     All other vehicles hold their commands ``alert.wanted`` [n, N + 1] (m/s2). ``count``: harm to minimise
-    (``episode.counts``), until the time ``horizon_s``, one number or [n]. If the deceleration of the closed form does
-    no harm, it is the result. Among decelerations of equal harm, the least harm in the tie-breaking count decides
-    (``counts.other_count``), then the middle one is the result. Harm has kinks and jumps as a function of the
-    deceleration, so a deceleration between two samples of the search may do less.
+    (``episode.counts``). ``horizon_s``: time until which harm counts, one number or [n]. If the deceleration of the
+    closed form does no harm, it is the result. Among decelerations of equal harm, the harm in a second count decides
+    (``counts.other_count``); then the middle one is the result. Harm has kinks and jumps as a function of the
+    deceleration, so a deceleration between two samples of the search may do less harm.
     """
     until_s = np.full(alert.n, horizon_s, np.float64)
     braking = np.maximum(-alert.wanted, 0.0)
@@ -55,15 +55,16 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
 
 
 def harms(alert: State, body: int, decelerations: Floats, count: str, until_s: Floats) -> Floats:
-    """Harm if vehicle ``body`` holds each of C decelerations, [2, n, C] m2/s2: in ``count``, and in the count for ties.
+    """Harm if vehicle ``body`` holds each of C decelerations, [2, n, C] m2/s2.
 
-    ``decelerations``: [n, C] m/s2, separate ones for each world. Harm counts until ``until_s`` [n].
+    Row 0 is the harm in ``count``, row 1 the harm in the count that breaks ties. ``decelerations`` [n, C] (m/s2) are
+    separate ones for each world. Harm counts until ``until_s`` [n].
     """
     return hold(alert, alert.wanted, [body], -decelerations[:, :, np.newaxis], until_s, count)
 
 
 def search_deceleration(alert: State, body: int, count: str, until_s: Floats) -> Floats:
-    """Best constant deceleration of vehicle ``body`` (m/s2), its harm in ``count`` and in the count for ties, [n, 3].
+    """Best constant deceleration of vehicle ``body`` (m/s2), with its harm as in ``harms`` (m2/s2), [n, 3].
 
     The search divides the range of decelerations into ``FIRST_PARTS`` equal cells, and then, again and again, every
     cell that may contain a better deceleration. A result is not within rounding of a jump of the harm, unless the jump
@@ -134,7 +135,7 @@ def take_middle(at, harm, best_so_far):
 
 @kernel
 def compare_harm(harm, best_so_far):
-    """-1 if ``harm`` [2] is less than the harm ``best_so_far[1:]``, 0 if equal, 1 if more (as in ``take_middle``)."""
+    """-1 if ``harm`` [2] is less than the harm ``best_so_far[1:]``, 0 if equal, 1 if more."""
     for count in range(2):  # the other count decides ties
         if abs(harm[count] - best_so_far[count + 1]) > TIE_MARGIN:
             return -1 if harm[count] < best_so_far[count + 1] else 1
@@ -153,7 +154,7 @@ class EV2XBM:
 
     Args:
         settings: settings of the episodes (``Game.settings``).
-        agents: body -> role, for vehicles driven by agents whose commands are not known at the alert.
+        agents: vehicle (1: Vehicle 1) -> role, for vehicles driven by agents whose commands are not known at the alert.
         count: harm to minimise: ``first``, ``total`` or ``honest`` (``episode.counts``).
 
     """

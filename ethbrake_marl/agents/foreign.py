@@ -206,8 +206,8 @@ def wrappers_of(env: Any) -> Iterator[Any]:
 def _was_normalised(model: Any) -> bool:
     """Whether a model was trained on normalised observations.
 
-    A sign is that the last observation in training lies outside the model's observation space, or that the model stores
-    the original observation, too (off-policy algorithms always do so).
+    The last observation in training is then outside the model's observation space, or the model also stores the
+    original observation. Off-policy algorithms always store it, so it says nothing about them.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

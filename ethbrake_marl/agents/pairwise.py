@@ -55,8 +55,8 @@ def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset,
 
     ``front`` and ``rear`` are the vehicles' speeds. Each vehicle coasts until its onset (s), then brakes to rest. So
     the motion has phases of constant acceleration: both coast, one brakes, both brake, one stands (regimes A to C of
-    the proof); the function looks for a contact in each phase. A contact without a closing speed is no impact. If
-    forces then press the rear vehicle against the front one, they stay in contact: harm 0.
+    the proof); the function looks for a contact in each phase. A contact without a closing speed is no impact. If the
+    rear vehicle then brakes less than the front vehicle, they stay in contact, and the harm is 0.
     """
     now = 0.0
     while now < until:

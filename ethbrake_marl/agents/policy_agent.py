@@ -79,7 +79,7 @@ class LearnedAgent:
             )
 
     def through(self, layers: tuple[Layer, ...]) -> LearnedAgent:
-        """The agent with observations of the state as it appears through ``layers``, such as messages."""
+        """The agent, observing the state through ``layers`` such as messages (``episode.layer``)."""
         return replace(self, observation=view_through(layers, self.observation or self.policy.observation))
 
     def begin(self, alert: State, body: int) -> None:
@@ -117,7 +117,7 @@ class PolicyAgent:
             )
 
     def through(self, layers: tuple[Layer, ...]) -> PolicyAgent:
-        """The agent with observations of the state as it appears through ``layers``, such as messages."""
+        """The agent, observing the state through ``layers`` such as messages (``episode.layer``)."""
         return replace(self, observation=view_through(layers, self.observation))
 
     def begin(self, alert: State, body: int) -> Any:

@@ -64,7 +64,7 @@ class Team(NamedTuple):
     """
 
     name: str  # in tables and messages
-    drivers: Mapping[int, Agent]  # body -> agent
+    drivers: Mapping[int, Agent]  # vehicle (1: Vehicle 1) -> agent
     shield: Shield | None = None  # it asks the drivers for proposals
 
     @staticmethod
@@ -102,7 +102,10 @@ class Team(NamedTuple):
 
 
 def check_agent(agent: Any, where: str) -> None:
-    """Raise ``InvalidInput`` unless an agent has ``name``, ``knows``, ``begin`` and ``act``. ``where``: its place."""
+    """Raise ``InvalidInput`` unless an agent has ``name``, ``knows``, ``begin`` and ``act``.
+
+    The message begins with ``where``.
+    """
     missing = [part for part in ("name", "knows", "begin", "act") if not hasattr(agent, part)]
     if missing:
         raise InvalidInput(
@@ -142,7 +145,7 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
 
 
 def play_to_end(game: Game, alert: State, team: Team) -> State:
-    """Let a team drive the worlds ``alert`` (at the alert) to the end; return the last state."""
+    """Let a team drive worlds from the alert to the end; return the last state."""
     for _, state in play(game, alert, team, donate=True):
         last = state
     return last

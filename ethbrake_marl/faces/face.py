@@ -45,7 +45,10 @@ class Face:
         return self.episode
 
     def _advance(self, actions: Floats) -> tuple[State, Step]:
-        """State after one step, and the ``Step``. The running episode changes only in ``_keep``."""
+        """State after one step, and the ``Step``, for ``actions`` [n, L].
+
+        The running episode changes only in ``_keep``.
+        """
         before = self._begun("step")
         if not self.begins_again and before.clock[0, ENDED] == 1.0:
             raise InvalidInput("step: no episode is running; call reset first")

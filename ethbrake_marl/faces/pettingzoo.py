@@ -131,7 +131,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     ) -> tuple[dict[str, Observations], Infos]:
         """Start an episode in the first world of ``seed``, or without a seed in the next world.
 
-        Options choose another world: ``{"initial_state": {"gaps_m": [7, 7], ...}}``, or a world of an evaluation list,
+        Options choose the world: ``{"initial_state": {"gaps_m": [7, 7], ...}}``, or a world of an evaluation list,
         ``{"listed_world": {"seed": 7, "number": 3}}``.
         """
         stream, state = self.stream.reset(1, None if seed is None else chosen_seed(seed), options)

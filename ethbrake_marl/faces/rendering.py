@@ -59,7 +59,7 @@ def render_metadata(many: bool = False) -> dict[str, Any]:
 
 
 class Metadata:
-    """The attribute ``metadata`` of an environment's class. Packages that draw are imported when it is read."""
+    """The attribute ``metadata`` of an environment's class. Reading it imports the packages that draw."""
 
     def __init__(self, **entries: Any) -> None:
         self.other = entries

@@ -40,14 +40,14 @@ class EpisodeShieldMemory(NamedTuple):
     agent: Any  # memory of the policy
     proposed: Floats  # [n, 1] last proposal
     applied: Floats  # [n, 1] last action
-    intervened: Bools  # [n, N] whether they differ
+    intervened: Bools  # [n, N] whether proposal and action differ
 
 
 class EpisodeShield:
     """Algorithm 1 of the paper, for one learner. Actions that the caller proposes have no effect.
 
     Args:
-        drivers: body of the learner -> its policy.
+        drivers: the learner's vehicle (1: Vehicle 1) -> its policy.
         harm_count: harm to compare: ``first``, ``total`` or ``honest`` (``episode.counts``).
         bound: how H* is computed: ``coupled`` (the episode's own physics) or ``pairwise`` (the paper's closed form).
 

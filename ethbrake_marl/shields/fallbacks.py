@@ -19,9 +19,9 @@ from ethbrake_marl.episode.hold import descend, hold
 from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.motion.layout import Floats
 
-BRAKE_SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
-FALLBACK_ROUNDS = 2  # in which they try them
-CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4])  # of the plan's next actions, tried as constants
+BRAKE_SHARES = np.linspace(0.0, 1.0, 21)  # shares of its brakes that each of several learners tries at the alert
+FALLBACK_ROUNDS = 2  # rounds in which the learners take turns to try them
+CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4])  # added to the plan's next actions, then held
 SINGLE_ACTIONS = np.linspace(0.0, -1.0, 4)  # actions of one of several learners, tried while the others follow the plan
 
 
@@ -54,9 +54,9 @@ def constant_plans(game: Game, actions: Floats) -> Floats:
 def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
     """Constant actions with the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
 
-    Candidates are the next actions of ``plans`` [n, T, L], all changed by one of ``CHANGES``; and with several learners
-    ``SINGLE_ACTIONS`` of one learner while the others hold the plan's actions. ``states`` may contain several possible
-    states of each world, in consecutive rows; then the largest of their harms counts.
+    Candidates are the next actions of ``plans`` [n, T, L] with one of ``CHANGES`` added to all of them; with several
+    learners also each of ``SINGLE_ACTIONS`` for one learner while the others hold the plan's next actions. ``states``
+    may contain several possible states of each world, in consecutive rows; then the largest of their harms counts.
     """
     learners, rows, states_per_world = game.settings.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
     planned = plans[rows, np.minimum(states.steps[::states_per_world], plans.shape[1] - 1)]

@@ -44,7 +44,10 @@ class ShieldReason(IntEnum):
 
 
 class NamedShield(NamedTuple):
-    """Makes a shield of one class for a team. In the name ``NAME:TEXT``, ``TEXT`` sets the option ``argument``."""
+    """Makes a shield of one class for a team.
+
+    In a shield's name ``NAME:TEXT``, ``TEXT`` becomes the option whose name is in the field ``argument``.
+    """
 
     shield: Callable[..., Shield]  # (drivers, harm_count=..., **options); one called ``scenario`` is the worlds'
     argument: str | None = None  # the option that is the text after the colon

@@ -113,7 +113,7 @@ class Normal(Distribution):
 
 
 class LogNormalShape(ScenarioPart):
-    """Median and standard deviation of the logarithm before truncation, and the smallest and largest value."""
+    """Median, and standard deviation of the logarithm, before truncation; smallest and largest possible value."""
 
     median: PositiveNumber
     sigma: PositiveNumber
