@@ -1,4 +1,4 @@
-"""Policies of other libraries: how each kind is called, and which settings of its training are applied or refused."""
+"""Policies of other libraries: calls of each kind, and the settings of its training that are applied or refused."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ class PolicyAgent:
     knows: str = MESSAGES
 
     def check(self, game: Game, body: int) -> None:
-        """Raise ``InvalidInput`` if the policy may have been trained on other features than it would get here."""
+        """Raise ``InvalidInput`` if the policy may have been trained on other features than those in ``game``."""
         if self.is_assumed and game.views[body] != self.observation:
             raise InvalidInput(
                 f"agent {self.name!r}: nothing says which features the policy observes, and vehicle_{body} of scenario"

@@ -85,7 +85,7 @@ def guard_team(team: Team, mode: str, scenario: Scenario | None, harm_count: str
 
 
 def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Team], Team], harm_count: str) -> Any:
-    """Shielded copy of an environment. If ``policy`` is a name, its agent minimises ``harm_count``.
+    """Shielded copy of an environment. If ``policy`` is the name of an agent, this agent minimises ``harm_count``.
 
     ``base`` is ``env`` without wrappers; ``around`` puts the shield around a team.
     """

@@ -129,7 +129,7 @@ class Stream(NamedTuple):
 
 
 def chosen_seed(seed: int | None) -> int:
-    """Seed, or for None a random one of 63 bits. Raises ``InvalidInput`` for a bad seed."""
+    """The seed, or a random seed of 63 bits for None. Raises ``InvalidInput`` for a bad seed."""
     if seed is None:
         return int.from_bytes(np.random.SeedSequence().generate_state(2).tobytes(), "little") % 2**63
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:

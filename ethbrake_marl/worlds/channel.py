@@ -13,7 +13,8 @@ drawn from ``sensing_s``.
 
 Vehicle i can react from ``latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))`` on: its own
 latency is over, and it has the message of Vehicle 1 or has seen the vehicle ahead brake. It reacts to vehicle j from
-``max(latency_i, min(tau_ij, hop_ij))`` on. With the preset ``paper`` it knows everything once its own latency is over.
+``max(latency_i, min(tau_ij, hop_ij))`` on. With the preset ``paper`` a vehicle knows everything once its own latency is
+over.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Checks of a scenario that involve several keys. Each refuses the first mistake, with its place."""
+"""Checks of a scenario that involve several keys. Each check refuses the first mistake, with its place."""
 
 from __future__ import annotations
 
