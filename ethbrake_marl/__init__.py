@@ -1,7 +1,7 @@
 """Research environment for ethical emergency braking: exact physics of several vehicles, and a shield that bounds harm.
 
-Importing the package registers ``EthBrake-v2`` with Gymnasium and, from its version 1.27 on, ``ethbrake/ethbrake-v2``
-with PettingZoo. A public name is imported when it is first used, so torch and matplotlib are loaded only if needed.
+Importing the package registers ``EthBrake-v2`` with Gymnasium, and ``ethbrake/ethbrake-v2`` with PettingZoo (from
+version 1.27 on). A public name is imported when it is first used, so torch and matplotlib are loaded only if needed.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def _usable() -> list[str]:
 
 
 def _import_public(name: str) -> Any:
-    """Import a public name when it is first used (the package's ``__getattr__``)."""
+    """Public object called ``name``, imported at its first use (the package's ``__getattr__``)."""
     if name == "__all__":
         return ["__version__", *_usable()]
     if name not in _HOMES:

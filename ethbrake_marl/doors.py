@@ -1,7 +1,7 @@
-"""Lazy imports: the ``__init__`` of a folder lists public names, and each is imported when it is first used.
+"""Lazy imports: the ``__init__`` of a folder lists public names; a name is imported at its first use.
 
-The list is a block of imports under ``if TYPE_CHECKING``, which type checkers understand. This module reads it from the
-source file.
+The list is a block of imports under ``if TYPE_CHECKING``, which type checkers understand. This module reads the list
+from the source file.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 @cache
 def names_behind(file: str) -> dict[str, str]:
-    """Name -> module of the imports in the ``if TYPE_CHECKING`` block of an ``__init__.py``."""
+    """Public name -> module that defines it, from the ``if TYPE_CHECKING`` block of the ``__init__.py`` at ``file``."""
     statements = ast.parse(Path(file).read_text("utf-8")).body
     block = next(statement for statement in statements if isinstance(statement, ast.If)).body
     imports = [statement for statement in block if isinstance(statement, ast.ImportFrom)]
@@ -25,9 +25,9 @@ def names_behind(file: str) -> dict[str, str]:
 
 
 def front_door(package: str, file: str) -> Callable[[str], Any]:
-    """Return ``__getattr__`` for a package's ``__init__``, and set its ``__all__`` and ``__dir__``.
+    """Set ``__all__`` and ``__dir__`` of a package; return its ``__getattr__``, which imports a name at its first use.
 
-    ``package`` and ``file`` are its ``__name__`` and ``__file__``.
+    ``package`` and ``file`` are ``__name__`` and ``__file__`` of the package's ``__init__``.
     """
     folder, names = sys.modules[package], names_behind(file)
     vars(folder).update(__all__=[*names], __dir__=lambda: sorted({*vars(folder), *names}))

@@ -21,9 +21,9 @@ _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
 
 def plain_text(text: str, keep: str = "") -> str:
-    """``text`` with unprintable characters as Python escapes, except those in ``keep``.
+    """Text in which Python escapes replace all unprintable characters except those in ``keep``.
 
-    So a name or path from a file cannot move the cursor or print backwards.
+    So a name or path from a file cannot move the terminal's cursor or print backwards.
     """
     if text.isprintable():
         return text
@@ -31,7 +31,7 @@ def plain_text(text: str, keep: str = "") -> str:
 
 
 def one_line(text: str) -> str:
-    """``plain_text`` on one line; if it is longer than ``LINE_LIMIT``, its middle is left out."""
+    """Printable text on one line, without its middle if it has more than ``LINE_LIMIT`` characters."""
     blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
     line = plain_text(blanks)
     if len(text) == len(blanks) and len(line) <= LINE_LIMIT:
@@ -40,15 +40,16 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """Number with its noun, such as ``1 world`` or ``10,000 worlds``. ``thing`` is the singular."""
+    """Number with its noun, such as ``1 world`` or ``10,000 worlds``. ``thing`` is the noun in the singular."""
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
 
 def describe_error(error: BaseException, path: str | None = None) -> str:
-    """Describe an exception from a user's code in a few words, with the line that raised it.
+    """Short text about an exception from a user's code: class, message, and the line that raised it.
 
-    The line is the last one of the file ``path`` in the traceback; None: the innermost line. An error of this package
-    is described by its message only.
+    ``path``: the user's file; the line is then the last one of this file in the traceback. None: the innermost line of
+    the traceback, which is left out if this package raised the error. An error of this package is described without its
+    class.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -90,11 +91,11 @@ class UnknownName(InvalidInput):
 
 
 class AlreadyExists(EthBrakeError, FileExistsError):
-    """A file or a registered name already exists. ``force`` (``--force``) overwrites a file."""
+    """A file or a registered name already exists. With ``force`` (``--force``) a file is overwritten."""
 
 
 class CorruptBundle(EthBrakeError, ValueError):
-    """A policy bundle is damaged, or the folder is not a bundle. Nothing was loaded."""
+    """A policy bundle (the folder of a trained policy) is damaged, or a folder is no bundle. Nothing was loaded."""
 
 
 _EXTRA_OF = {
@@ -122,7 +123,7 @@ class MissingExtra(EthBrakeError, ImportError):
 
 @contextmanager
 def naming_extras() -> Iterator[None]:
-    """Turn a failed import of an optional package, inside the block, into ``MissingExtra``."""
+    """Context in which a failed import of an optional package raises ``MissingExtra``."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -133,7 +134,7 @@ def naming_extras() -> Iterator[None]:
 
 
 def need(package: str) -> None:
-    """Raise ``MissingExtra`` unless the optional ``package`` is installed. It is not imported."""
+    """Raise ``MissingExtra`` unless the optional ``package`` is installed. The check does not import it."""
     if find_spec(package) is None:
         raise _missing(package)
 
@@ -146,8 +147,8 @@ def _missing(package: str) -> MissingExtra:
 class PhysicsError(EthBrakeError, ArithmeticError):
     """Some worlds of a batch could not be simulated, because of a defect in the physics code.
 
-    The other worlds are not affected. ``worlds``: number of each failed world (or its row, if the caller made the
-    batch) -> reason.
+    The other worlds are not affected. ``worlds``: world -> reason. A world is named by its number, or by its row in the
+    batch if the caller supplied the worlds.
     """
 
     def __init__(self, worlds: Mapping[int, str]) -> None:
@@ -163,7 +164,8 @@ class PhysicsError(EthBrakeError, ArithmeticError):
 class AgentFailed(InvalidInput):
     """A user's agent raised an exception or returned invalid actions. The message names agent, world and step.
 
-    ``row``: the world's row in the batch, or None if unknown. ``reason``: what went wrong, and at which step.
+    ``row``: number of the world, or its row in the batch if the caller supplied the worlds; None: unknown. ``reason``:
+    what went wrong, and at which step.
     """
 
     def __init__(self, agent: str, row: int | None, reason: str) -> None:
@@ -177,9 +179,9 @@ class AgentFailed(InvalidInput):
     @staticmethod
     @contextmanager
     def naming(name: str, other_agents: Collection[str] = ()) -> Iterator[None]:
-        """Replace the agent's name by ``name`` in an ``AgentFailed`` that the block raises.
+        """Context in which every ``AgentFailed`` gets ``name`` as the name of its agent.
 
-        ``other_agents`` are the names of other vehicles' agents, whose errors stay unchanged.
+        ``other_agents``: names of other vehicles' agents, whose errors stay unchanged.
         """
         try:
             yield
@@ -190,7 +192,7 @@ class AgentFailed(InvalidInput):
 
 
 class Unfamiliar(UserWarning):
-    """A trained policy, or a table of best known harm, was made for other worlds or another physics."""
+    """A trained policy, or a table of best known harm, was made for other worlds or for other physics."""
 
 
 class CacheFault(UserWarning):
@@ -202,9 +204,10 @@ class FreeImpacts(UserWarning):
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Error for an unknown name. Its message shows the new name, a similar one, or all ``known`` names.
+    """Error for an unknown name. Its message suggests a similar name, or the new name in 2.0, or lists ``known``.
 
-    ``kind`` is a noun such as ``scenario``. ``may_be_own``: the message adds that own names must be registered first.
+    ``kind``: noun such as ``scenario``. ``may_be_own``: a message that lists names also says that a user's own part
+    must be registered first.
     """
     names = sorted({*known})
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
@@ -215,7 +218,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number in [``least``, ``most``]; ``what`` is its name."""
+    """Raise ``InvalidInput`` unless ``value`` is a whole number in [``least``, ``most``]; ``what`` names it."""
     is_whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (is_whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"
@@ -223,7 +226,7 @@ def check_whole_number(what: str, value: object, least: int, most: int | None = 
 
 
 def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> None:
-    """Raise ``InvalidInput`` unless there is exactly one learner; the message ends with ``advice``."""
+    """Raise ``InvalidInput`` unless ``learners`` has exactly one vehicle; the message ends with ``advice``."""
     if len(learners) != 1:
         raise InvalidInput(
             f"scenario {scenario!r} has {len(learners)} learners ({', '.join(learners) or 'none'}); {advice}"

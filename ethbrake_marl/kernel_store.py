@@ -1,7 +1,7 @@
-"""The cache of compiled physics code, and functions to call before the first compilation. Imports no numba.
+"""Cache of compiled physics code, and notices before the first compilation. Does not import numba.
 
-Each file begins with a digest of its name and its data, which is checked before the data are used. Whatever the folder
-contains, and wherever it cannot be written, programs compile again and warn once: no error comes from here.
+Each file begins with a digest of its name and data, which is checked before the data are used. A damaged file, or a
+folder that cannot be written, is no error: the program compiles again and warns once.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _warned: list[str] = []
 
 
 def cache_folder() -> Path | None:
-    """Folder of this package in ``$NUMBA_CACHE_DIR`` or the user's cache; None without a home folder."""
+    """Folder of compiled code, below ``$NUMBA_CACHE_DIR`` or the user's cache; None without a home folder."""
     try:
         home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:
@@ -35,9 +35,9 @@ def cache_folder() -> Path | None:
 
 
 def load_data(name: str, read: Callable[[bytes], Any]) -> Any:
-    """``read(data)`` of the data that are stored under a name; None if there are none.
+    """Result of ``read`` for the data that are stored under a name; None if there are none.
 
-    If they are damaged, or ``read`` raises an error, warns, deletes them and returns None.
+    Data that are damaged, or for which ``read`` raises an error, are deleted with a warning; the result is then None.
     """
     try:
         path = _trusted_folder() / f"{name}{SUFFIX}"
@@ -52,7 +52,7 @@ def load_data(name: str, read: Callable[[bytes], Any]) -> Any:
 
 
 def save_data(name: str, data: bytes) -> None:
-    """Store data under a name, which must contain all that decides the data. Warns if this is impossible."""
+    """Store data under a name, which must differ whenever the data may differ. Warns if storing is impossible."""
     try:
         path = _trusted_folder() / f"{name}{SUFFIX}"
         write_file(path, _digest(path, data) + data)
@@ -61,7 +61,7 @@ def save_data(name: str, data: bytes) -> None:
 
 
 def obstacle() -> str:
-    """Why compiled code cannot be stored; empty if it can."""
+    """Why compiled code cannot be stored; "" if it can be stored."""
     try:
         with TemporaryFile(dir=_trusted_folder()) as file:
             file.write(bytes(100_000))  # a disk that is full may still have names
@@ -71,13 +71,13 @@ def obstacle() -> str:
 
 
 def delete_damaged() -> tuple[int, int]:
-    """Delete damaged files. Return the number of damaged files and of those that cannot be deleted."""
+    """Delete damaged files. Return how many are damaged, and how many of these cannot be deleted."""
     damaged = [path for path in _stored_files() if _read(path, bytes) is None]
     return len(damaged), sum(not _delete(path) for path in damaged)
 
 
 def on_first_compilation(tell: Callable[[bool], None]) -> None:
-    """Call ``tell(is_empty)`` once, just before this process compiles for the first time.
+    """Register a function: this process calls ``tell(is_empty)`` once, just before it first compiles.
 
     ``is_empty``: the cache contains no compiled code yet.
     """
@@ -95,9 +95,9 @@ def _stored_files() -> list[Path]:
 
 
 def _trusted_folder() -> Path:
-    """Folder, which is created if it is missing. Raises ``OSError`` if there is none to use.
+    """Folder of compiled code, created if it is missing. Raises ``OSError`` if it cannot be used.
 
-    It must belong to this user or root, since machine code from it will be run.
+    It must belong to this user or root, because machine code from it will be run.
     """
     folder = cache_folder()
     if folder is None:
@@ -109,7 +109,7 @@ def _trusted_folder() -> Path:
 
 
 def _read(path: Path, read: Callable[[bytes], Any]) -> Any:
-    """``read(data)`` of the data in a file; None if it is damaged."""
+    """Result of ``read`` for the data in a file; None if the file is damaged."""
     try:
         content = path.read_bytes() if path.is_file() else b""
         data = content[_DIGEST_BYTES:]
@@ -119,7 +119,7 @@ def _read(path: Path, read: Callable[[bytes], Any]) -> Any:
 
 
 def _delete(path: Path) -> bool:
-    """Delete whatever stands in the place of a file. Return whether this was possible."""
+    """Delete the file, folder or link at ``path``. Return whether this was possible."""
     try:
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
     except OSError:

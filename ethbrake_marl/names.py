@@ -6,9 +6,9 @@
     agent   = NAME[:ARGUMENT][@PATH], or FILE.py:FUNCTION[:ARGUMENT][@PATH]
     wrapper = NAME[:ARGUMENT], a search or a shield around what stands before it
 
-The tables ``AGENTS`` and ``WRAPPERS`` contain the names. An entry called ``NAME.ARGUMENT`` is used for this argument
-only. An agent's entry may also be a group: a list of specs, such as ``ladder``. Lists are split at commas, and specs at
-``+``, so no path may contain one of them.
+The tables ``AGENTS`` and ``WRAPPERS`` contain the names. An entry called ``NAME.ARGUMENT`` replaces the entry ``NAME``
+for this argument. An agent's entry may also be a group: a list of specs, such as ``ladder``. Lists are split at commas,
+and specs at ``+``, so no path may contain a comma or a plus.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class AgentSettings:
     options: Mapping[str, Any] = field(default_factory=dict)  # of ``eb.shield``; a name has none
 
     def needed_scenario(self) -> Scenario:
-        """Scenario. Raises ``InvalidInput`` if it is unknown."""
+        """Scenario in which the agent drives. Raises ``InvalidInput`` if it is unknown."""
         if self.scenario is None:
             raise InvalidInput(
                 f"agent {self.spec!r}: needs a scenario, for instance make_agent({self.spec!r},"
@@ -83,7 +83,7 @@ def register_agent(
     knows: str = UNSTATED,
     form: str | None = None,
 ) -> None:
-    """Give an agent a name, which can be used wherever agents are named. Entry points: ``ethbrake_marl.agents``.
+    """Register an agent under a name, for use wherever agents are named. Entry points: ``ethbrake_marl.agents``.
 
     Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for an invalid one.
 
@@ -107,10 +107,11 @@ def register_shield(
     knows: str = UNSTATED,
     form: str | None = None,
 ) -> None:
-    """Give a shield or a search a name that can stand after a ``+``. Entry points: ``ethbrake_marl.shields``.
+    """Register a shield or search under a name that can follow a ``+``. Entry points: ``ethbrake_marl.shields``.
 
-    ``make(team, argument, settings)`` returns the wrapped team; the rest is as in ``register_agent``. A shield's name
-    is also a mode of ``eb.shield``, which passes further keywords as ``settings.options``.
+    ``make(team, argument, settings)`` returns the team with the shield or search around it; the other arguments are as
+    in ``register_agent``. A shield's name is also a ``mode`` of ``eb.shield``, which passes further keywords as
+    ``settings.options``.
     """
     _add(WRAPPERS, name, make, about, knows, form)
 
@@ -131,11 +132,11 @@ WRAPPERS: Registry[AgentEntry] = Registry("shield or search", "shields", registe
 
 
 def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:
-    """Agent or team with a name, such as ``"constant:3.5"`` or ``"ppo+step"`` (syntax: module docstring).
+    """Agent or team for a name such as ``"constant:3.5"`` or ``"ppo+step"`` (syntax: docstring of ``names``).
 
-    Teams, wrappers and agents that look ahead need ``scenario``. ``harm_count``: what optimising agents minimise
-    (``episode.counts``). A Python file in the name runs with all your rights.
-    Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for a bad argument.
+    Teams, wrappers and agents that look ahead need ``scenario``. ``harm_count``: harm that optimising agents minimise
+    (``episode.counts``). If the name contains a Python file, the file runs with all your rights. Raises ``UnknownName``
+    for an unknown name, and ``InvalidInput`` for a bad argument.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_agent("constant:3.5").name
@@ -157,21 +158,21 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
 
 
 def wrap_team(team: Team, wrapper: str, settings: AgentSettings) -> Team:
-    """Team inside the shield or search ``wrapper``, such as ``episode:pairwise``."""
+    """Team with a shield or search around it. ``wrapper``: its name, such as ``episode:pairwise``."""
     entry, argument = _look_up(WRAPPERS, *wrapper.partition(":")[::2])
     result: Team = _call_maker(settings.spec, entry.make, team, argument, settings)
     return result._replace(name=settings.spec)
 
 
 def team_of(driver: Driver, scenario: Scenario) -> Team:
-    """Team for all learners of a scenario. A single agent drives each learner, with separate memories."""
+    """Team for all learners of a scenario. A single agent drives every learner, with a separate memory for each."""
     if isinstance(driver, Team):
         return driver
     return Team(driver.name, dict.fromkeys(scenario.learners, driver))
 
 
 def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Spec -> team. A text may list several specs, separated by commas; groups are expanded.
+    """Teams by name, spec -> team. ``specs``: a list, or a text with commas between specs; groups are expanded.
 
     Raises the errors of ``make_agent``, and ``InvalidInput`` for a repeated spec.
     """
@@ -185,7 +186,7 @@ def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: st
 
 
 def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Name -> team for any description of agents.
+    """Teams by name, name -> team, for any description of agents.
 
     ``agents`` is a text or list as in ``make_teams``; or a mapping from names to specs, agents, teams, or mappings from
     vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``. Raises ``InvalidInput`` for
@@ -219,7 +220,7 @@ def _driver(agent: Any, scenario: Scenario, harm_count: str) -> Any:
 
 
 def group(name: str) -> list[str]:
-    """Specs of a group: those of the entry ``NAME``, then of all ``NAME.MORE``; [] for any other name."""
+    """Specs of a group: those of the entry ``name``, then of all entries ``NAME.MORE``; [] if ``name`` is no group."""
     if name not in AGENTS or callable(AGENTS[name].make):
         return []
     spec_lists: list[Any] = [AGENTS[entry].make for entry in AGENTS if entry == name or entry.startswith(f"{name}.")]
@@ -227,7 +228,7 @@ def group(name: str) -> list[str]:
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a list of specs at its commas. Raises the error of ``check_path`` for a path that exists."""
+    """Split a text into specs at its commas. Raises ``InvalidInput`` for an existing path with a comma or plus."""
     begins = [match.end() for match in re.finditer(r"^|[,@]", text)]
     ends = [match.end() for match in re.finditer(r"(?=[,+]|$)|\.py(?=:)", text)]
     for begin, end in product(begins, ends):
@@ -238,7 +239,7 @@ def split_specs(text: str) -> list[str]:
 
 
 def check_path(path: str | os.PathLike[str]) -> None:
-    """Raise ``InvalidInput`` for a path that cannot stand in the name of an agent."""
+    """Raise ``InvalidInput`` for a path with a comma or plus, which cannot stand in the name of an agent."""
     if {",", "+"} & {*str(path)}:
         raise InvalidInput(
             f"{path}: a path in the name of an agent must have no comma and no plus; rename it, or make a link to it"
@@ -246,6 +247,7 @@ def check_path(path: str | os.PathLike[str]) -> None:
 
 
 def _make(core: str, settings: AgentSettings) -> Driver:
+    """Agent or team for a spec without wrappers."""
     in_file = IN_FILE.fullmatch(core)
     match = in_file or PLAIN.fullmatch(core)
     if match is None:
@@ -271,6 +273,11 @@ def _make(core: str, settings: AgentSettings) -> Driver:
 def _look_up(
     table: Registry[AgentEntry], name: str, argument: str, policy: str | None = None
 ) -> tuple[AgentEntry, str | None]:
+    """Entry of a table for a name with this argument, and the argument to pass to the entry's ``make``.
+
+    With a policy's path, a name that is no agent is taken for the algorithm that trained the policy. Raises
+    ``UnknownName``, and ``InvalidInput`` for an argument or path that the entry does not take.
+    """
     rest, _, last = argument.rpartition(":")
     if argument and f"{name}.{last}" in table:
         return table[f"{name}.{last}"], rest or None
@@ -287,6 +294,7 @@ def _look_up(
 
 
 def _in_file(match: re.Match[str], settings: AgentSettings) -> Callable[..., Any]:
+    """Function of a user's Python file that makes an agent, as a function of argument and settings."""
     function = load_from_file(match["file"], match["name"], reads=settings.policy)
     if not callable(function):
         raise InvalidInput(
@@ -304,7 +312,7 @@ def _in_file(match: re.Match[str], settings: AgentSettings) -> Callable[..., Any
 
 
 def _call_maker(spec: str, make: Callable[..., Any], *arguments: Any) -> Any:
-    """Call the user's function that makes an agent; any error becomes an ``InvalidInput``."""
+    """Call a user's function that makes an agent or team; an error of the user's code becomes an ``InvalidInput``."""
     try:
         return make(*arguments)
     except EthBrakeError:
@@ -321,9 +329,9 @@ def open_game(
     reward_vector: Any = None,
     report: Sequence[str] = (),
 ) -> tuple[Scenario, Game]:
-    """Scenario and its game. Vehicles whose role names an agent are driven by this agent.
+    """The scenario with these learners and observations, and its game. Arguments: see ``EthBrakeParallelEnv``.
 
-    Arguments as in ``EthBrakeParallelEnv``.
+    A vehicle whose role is the name of an agent is driven by that agent.
     """
     loaded = load_scenario(scenario)
     if learners is not None:
@@ -341,7 +349,10 @@ def require_learner(scenario: Scenario) -> None:
 
 
 def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
-    """Body -> agent, for the scripts that look at the state."""
+    """Agents of the vehicles whose role is the name of an agent, by the vehicle's number (1: Vehicle 1).
+
+    Raises ``InvalidInput`` for a role that is unknown, or that names a team.
+    """
     scripts = {}
     for body, (vehicle, role) in enumerate(scenario.roles.items(), 1):
         if role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):
@@ -362,7 +373,7 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
 
 
 def listed_agents() -> list[AgentEntry]:
-    """Entries of all agents and wrappers that can be loaded, without groups. A wrapper's form has its +."""
+    """Entries of all agents and wrappers that can be loaded, without groups. The form of a wrapper begins with +."""
     agents = [entry for entry in AGENTS.usable().values() if callable(entry.make)]
     return agents + [replace(entry, form=f"+{entry.form}") for entry in WRAPPERS.usable().values()]
 

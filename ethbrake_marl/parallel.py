@@ -76,7 +76,10 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
 
 @contextmanager
 def _blocked_interrupt() -> Iterator[None]:
-    """Block Ctrl-C, and in the processes that the block starts, until they ignore it; where the system can."""
+    """Context in which Ctrl-C is blocked, where the operating system allows it.
+
+    Processes that start in the context inherit the block; they end it when they have begun to ignore Ctrl-C.
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -98,7 +101,7 @@ def _pickled(call: Call) -> bytes:
 
 
 def _answer(caller: int, call: bytes) -> Any:
-    """Run a pickled call of the process ``caller``, in another process or thread; its prints go to stderr."""
+    """Result of a pickled call, whose prints go to stderr. A process other than ``caller`` (an id) becomes a worker."""
     if os.getpid() != caller:
         _become_worker()
     with redirect_stdout(sys.stderr):
@@ -108,7 +111,7 @@ def _answer(caller: int, call: bytes) -> Any:
 
 @cache
 def _become_worker() -> None:
-    """Leave Ctrl-C to the parent process and to calls that listen to it; exit when the parent ends, even in a call."""
+    """Make this process a worker: ignore Ctrl-C (calls may still listen to it), and exit when the parent ends."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         if hasattr(signal, "pthread_sigmask"):

@@ -46,7 +46,7 @@ class Progress:
 
     @staticmethod
     def listener(on_progress: ProgressOption) -> OnProgress | None:
-        """Function to call with each ``Progress``, or None.
+        """Function that receives each ``Progress``; None: no reports.
 
         ``on_progress`` is a function; or ``"show"``: print progress on stderr (if there is one); or None.
         """
@@ -73,7 +73,7 @@ class ShownProgress:
         self._open = ""  # name of the task in the terminal's last line; empty if this line has ended
 
     def __call__(self, progress: Progress) -> None:
-        """Print the progress, unless a line was printed shortly before."""
+        """Print the note, if any, and the progress: on a terminal always, otherwise at most every ten seconds."""
         now, task = time.monotonic(), progress.name.partition(": ")[0]
         if self._open not in ("", task) or progress.note:
             self.end()

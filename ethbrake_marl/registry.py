@@ -6,8 +6,8 @@ its ``pyproject.toml``:
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
 
-This package has a table ``parts.py`` instead, for its core and in the folder of each extension. When the name is first
-used, the entry point is loaded and its value is passed to the ``register_...`` function.
+This package lists its own parts in tables instead, the ``parts.py`` of the core and of each extension. When a name is
+first used, the entry point is loaded and its value is passed to the ``register_...`` function.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """Name -> entry points of a group such as ``agents``, this package's first; several may have one name."""
+    """Entry points of a group such as ``agents``, by name: this package's first. Several packages may use one name."""
     by_name: dict[str, list[EntryPoint]] = {}
     foreign_points = [point for point in entry_points(group=f"ethbrake_marl.{group}") if giver(point) != DISTRIBUTION]
     for point in (*sorted(own_points(group), key=by_its_name), *sorted(foreign_points, key=by_its_name)):
@@ -65,7 +65,7 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def own_points(group: str) -> list[EntryPoint]:
-    """Parts of a group in the tables ``parts.py`` of this package."""
+    """Entry points of a group for this package's own parts, from its tables ``parts.py``."""
     package = __name__.rpartition(".")[0]
     folder = files(package) / "extensions"
     extensions = [path.name for path in folder.iterdir() if (path / "parts.py").is_file()] if folder.is_dir() else []
@@ -132,7 +132,7 @@ class Registry(Mapping[str, T]):
         return self.loaded[name]
 
     def load(self, name: str) -> list[str]:
-        """Load an object if needed; return all names that its entry point defines (several if it is a dictionary).
+        """Load an object if needed; return the names that its entry point defines (a dictionary defines several).
 
         Raises the errors of looking up a name.
         """
@@ -155,6 +155,7 @@ class Registry(Mapping[str, T]):
                 self._loading.discard(name)
 
     def _load(self, name: str, point: EntryPoint) -> list[str]:
+        """Load an entry point and register all objects that it defines; return their names."""
         where = f"{self.kind} {name!r}, {point.value} of the installed package {giver(point)}"
         try:
             with naming_extras():
@@ -176,9 +177,9 @@ class Registry(Mapping[str, T]):
         return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
-        """Add the object ``part``. Raises ``AlreadyExists`` if another object has the name.
+        """Add ``part`` under a name. Raises ``AlreadyExists`` if another object has the name.
 
-        ``is_same`` says whether the existing object equals ``part``; then there is nothing to add.
+        ``is_same(existing)`` says whether the object that already has the name equals ``part``; then nothing is added.
         """
         names_others = False  # whether an entry point of this name defines parts with other names
         if name not in self.loaded and name in self and name not in self._loading:

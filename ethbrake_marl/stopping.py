@@ -1,4 +1,4 @@
-"""What Ctrl-C and SIGTERM do: set a flag that a long computation checks between steps, or wait until it is safe."""
+"""Ctrl-C and SIGTERM during long computations: a flag to check between steps, and a way to postpone Ctrl-C."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def stop_on_signal() -> Iterator[Callable[[], bool]]:
 
 
 class Postponed:
-    """Ctrl-C in the main thread, postponed while code runs in which Python would lose an exception."""
+    """Postpones Ctrl-C in the main thread while code runs in which Python would lose an exception."""
 
     _handler: Any = None  # handler of Ctrl-C that waits; None: nothing is postponed
     _arrived = False
@@ -59,7 +59,10 @@ class Postponed:
         self._arrived = True
 
     def end(self, *, only_arrived: bool = False) -> None:
-        """Postpone no more, and act on a Ctrl-C that has arrived; ``only_arrived``: go on unless one has arrived."""
+        """Stop postponing, and act on a Ctrl-C that has arrived.
+
+        ``only_arrived``: if none has arrived, postpone further.
+        """
         if self._handler is not None and _in_main_thread() and (self._arrived or not only_arrived):
             handler, self._handler = self._handler, None
             signal.signal(signal.SIGINT, handler)

@@ -1,8 +1,8 @@
 """E-V2X-BM: brakes with the constant deceleration that does the least harm, chosen at the alert.
 
-``pairwise`` is the paper's closed form. ``coupled`` simulates the whole line with the physics of the episode. It
-includes what the closed form leaves out (changes of speed, later impacts, lasting contact), so it predicts the harm
-that happens.
+``pairwise`` is the paper's closed form. ``coupled`` simulates the whole line with the physics of the episode. The
+simulation includes what the closed form leaves out (changes of speed, later impacts, lasting contact), so it predicts
+the harm that happens.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ TIE_MARGIN = 1e-9  # harms (m2/s2) closer than this count as equal
 
 
 def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Floats = 8.0) -> ConstantDeceleration:
-    """Constant deceleration of vehicle ``body`` with the least simulated harm in every world, and this harm.
+    """Constant deceleration of vehicle ``body`` that does the least simulated harm, and this harm, in every world.
 
-    All other vehicles hold ``alert.wanted``. ``count`` is the harm to minimise (``episode.counts``). If the closed
-    form's choice does no harm, it is the result. Ties: the least harm in the other count decides, then the middle
-    deceleration. The harm has kinks and jumps, so a deceleration between two samples of the search may do less.
-    ``horizon_s``: time until which harm counts, one for all worlds or one for each, [n].
+    All other vehicles hold their commands ``alert.wanted`` [n, N + 1] (m/s2). ``count``: harm to minimise
+    (``episode.counts``). ``horizon_s``: time until which harm counts, one number or [n]. If the deceleration of the
+    closed form does no harm, it is the result. Among decelerations of equal harm, the harm in a second count decides
+    (``counts.other_count``); then the middle one is the result. Harm has kinks and jumps as a function of the
+    deceleration, so a deceleration between two samples of the search may do less harm.
     """
     until_s = np.full(alert.n, horizon_s, np.float64)
     braking = np.maximum(-alert.wanted, 0.0)
@@ -54,19 +55,20 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
 
 
 def harms(alert: State, body: int, decelerations: Floats, count: str, until_s: Floats) -> Floats:
-    """Harm if vehicle ``body`` holds each of the decelerations ``decelerations`` [n, C] (m/s2), [2, n, C].
+    """Harm if vehicle ``body`` holds each of C decelerations, [2, n, C] m2/s2.
 
-    The first row is the harm in ``count``, the second in the count that breaks ties.
+    Row 0 is the harm in ``count``, row 1 the harm in the count that breaks ties. ``decelerations`` [n, C] (m/s2) are
+    separate ones for each world. Harm counts until ``until_s`` [n].
     """
     return hold(alert, alert.wanted, [body], -decelerations[:, :, np.newaxis], until_s, count)
 
 
 def search_deceleration(alert: State, body: int, count: str, until_s: Floats) -> Floats:
-    """Best deceleration of each world and its harm, in ``count`` and in the count that breaks ties: [n, 3].
+    """Best constant deceleration of vehicle ``body`` (m/s2), with its harm as in ``harms`` (m2/s2), [n, 3].
 
-    It divides all decelerations into ``FIRST_PARTS`` equal cells, and then repeatedly those cells that may contain a
-    better one. A result is not within rounding of a jump, unless a jump is within rounding of one of the first cells'
-    ends.
+    The search divides the range of decelerations into ``FIRST_PARTS`` equal cells, and then, again and again, every
+    cell that may contain a better deceleration. A result is not within rounding of a jump of the harm, unless the jump
+    is within rounding of an end of one of the first cells.
     """
     best = np.full((alert.n, 3), np.inf)
     rows, step = np.arange(alert.n), alert.braking_capacity_mps2[:, body - 1] / FIRST_PARTS
@@ -85,12 +87,13 @@ def search_deceleration(alert: State, body: int, count: str, until_s: Floats) ->
 
 @large
 def find_cells(rows, at, harm, step, best, cells):
-    """Update the best decelerations, and return the number of cells that may contain a better one.
+    """Update the best decelerations; return the number of cells that may contain a better one.
 
-    A cell is the interval between two neighbouring samples. It may contain a better one if the smaller harm at its
-    ends, minus the largest change of harm in this cell and the two beside it, is below the best harm. Row j of ``at``
-    [m, C] and ``harm`` [2, m, C] are samples of the world ``rows[j]``, ``step[rows[j]]`` m/s2 apart. ``best`` [n, 3]
-    are decelerations and their harms. ``cells`` [2, .] receives j and the cell's number in row j.
+    A cell is the interval between two neighbouring samples. It may contain a better deceleration if the smaller harm at
+    its ends, minus the largest change of harm in this cell and its two neighbours, is below the best harm. Row j of
+    ``at`` [m, C] (m/s2) and ``harm`` [2, m, C] (m2/s2) has the samples of the world ``rows[j]``, ``step[rows[j]]`` m/s2
+    apart. ``best`` [n, 3]: best decelerations so far, with their harm in both counts. ``cells`` [2, .] receives, for
+    each of these cells, j and the number of the cell in row j.
     """
     count, last = 0, at.shape[1] - 1
     for j in range(at.shape[0]):
@@ -115,9 +118,10 @@ def find_cells(rows, at, harm, step, best, cells):
 
 @kernel
 def take_middle(at, harm, best_so_far):
-    """Set ``known[0]`` to the middle one of the decelerations ``at`` [C] whose ``harm`` [2, C] equals ``known[1:]``.
+    """Set ``best_so_far[0]`` to the middle one of the decelerations ``at`` [C] whose harm equals ``best_so_far[1:]``.
 
-    ``best_so_far`` [3] is the best deceleration so far (m/s2), with its harm in both counts.
+    ``harm`` [2, C]: harm of the decelerations in both counts. ``best_so_far`` [3]: best deceleration (m/s2) and its
+    harm.
     """
     ties = 0
     for c in range(len(at)):
@@ -131,7 +135,7 @@ def take_middle(at, harm, best_so_far):
 
 @kernel
 def compare_harm(harm, best_so_far):
-    """-1 if ``harm`` [2] is less than ``known[1:]``, 0 if equal, 1 if more (``best_so_far`` as in ``take_middle``)."""
+    """-1 if ``harm`` [2] is less than the harm ``best_so_far[1:]``, 0 if equal, 1 if more."""
     for count in range(2):  # the other count decides ties
         if abs(harm[count] - best_so_far[count + 1]) > TIE_MARGIN:
             return -1 if harm[count] < best_so_far[count + 1] else 1
@@ -150,7 +154,7 @@ class EV2XBM:
 
     Args:
         settings: settings of the episodes (``Game.settings``).
-        agents: body -> role, for vehicles driven by agents whose commands are not known at the alert.
+        agents: vehicle (1: Vehicle 1) -> role, for vehicles driven by agents whose commands are not known at the alert.
         count: harm to minimise: ``first``, ``total`` or ``honest`` (``episode.counts``).
 
     """
@@ -163,7 +167,7 @@ class EV2XBM:
         self.settings, self.agents, self.count = settings, dict(agents), count
 
     def begin(self, alert: State, body: int) -> BaselineMemory:
-        """Choose the deceleration. Raises ``InvalidInput`` if another vehicle is driven by an agent."""
+        """Command and predicted harm of the episode. Raises ``InvalidInput`` if an agent drives another vehicle."""
         for vehicle, role in self.agents.items():
             if vehicle != body:
                 raise InvalidInput(
@@ -187,7 +191,7 @@ class EV2XBMPairwise:
     name, knows = "e_v2x_bm:pairwise", STATE
 
     def begin(self, alert: State, body: int) -> BaselineMemory:
-        """Choose the deceleration. Raises ``InvalidInput`` where the closed form does not hold (see ``pairwise``)."""
+        """Command and predicted harm. Raises ``InvalidInput`` where the closed form does not hold (``pairwise``)."""
         deceleration, harm = pairwise(alert, body)
         return BaselineMemory(-deceleration, harm)
 
@@ -204,6 +208,7 @@ def last_if_held(alert: State, settings: StepSettings) -> State:
 
 
 def make_e_v2x_bm(argument: str | None, settings: Any) -> EV2XBM | EV2XBMPairwise:
+    """Agent ``e_v2x_bm``, or ``e_v2x_bm:pairwise`` for the argument ``pairwise``."""
     if argument == "pairwise":
         return EV2XBMPairwise()
     if argument is not None:

@@ -1,4 +1,4 @@
-"""Policies of other libraries: how each kind is called, and which settings of its training are applied or refused."""
+"""Policies of other libraries: calls of each kind, and the settings of its training that are applied or refused."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ WRAPPED_ATTRIBUTES = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  
 
 
 def ask_of(policy: Any, who: str) -> Ask:
-    """Function ``(policy, observations) -> actions`` for this kind of policy, one without a memory.
+    """Function ``(policy, observations) -> actions`` that calls a policy of this kind. The policy has no memory.
 
-    Raises ``InvalidInput``, beginning with ``who``, for an unknown kind of policy, and for a model whose actions would
-    be random or depend on the rest of the batch.
+    Raises ``InvalidInput``, with a message that begins with ``who``, for an unknown kind of policy, and for a model
+    whose actions would be random or depend on the rest of the batch.
     """
     if isinstance(policy, bytes) or (hasattr(policy, "run") and hasattr(policy, "get_inputs")):
         return ask_onnx
@@ -63,7 +63,7 @@ def ask_function(function: Any, observations: Observations) -> Any:
 
 
 def ask_model(model: Any, observations: Observations) -> Any:
-    """Deterministic actions of an object with ``predict``; a ``VecNormalize`` of its training is applied.
+    """Deterministic actions of an object with ``predict``; the ``VecNormalize`` of its training is applied.
 
     Raises ``InvalidInput`` if the model also returns a state.
     """
@@ -92,7 +92,7 @@ def ask_torch(module: Any, observations: Observations) -> Any:
 
 
 def ask_onnx(session: Any, observations: Observations) -> Any:
-    """Output ``action`` of an ONNX model, or its first output."""
+    """Actions of an ONNX model: its output ``action``, or else its first output."""
     session = session_of(session)
     names = [output.name for output in session.get_outputs()]
     return session.run(["action" if "action" in names else names[0]], {session.get_inputs()[0].name: observations})[0]
@@ -124,7 +124,7 @@ def _opened(content: bytes) -> Any:
 
 
 def _refuse_training_mode(module: Any, who: str) -> None:
-    """Raise ``InvalidInput`` for a layer of a torch module whose training mode is on and affects its results."""
+    """Raise ``InvalidInput`` if a layer of a torch module is in training mode and this affects its results."""
     for layer in module.modules():
         shares = [getattr(layer, name, None) for name in ("p", "dropout")]
         random = any(isinstance(share, float | int) and share > 0.0 for share in shares)
@@ -146,8 +146,8 @@ def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
 def count_of_actions(policy: Any, count: int | None, who: str) -> int | None:
     """Number of discrete actions of a policy; None if it returns numbers in [-1, 1].
 
-    ``count`` is the number that the user states, or None. Raises ``InvalidInput``, beginning with ``who``, if the
-    policy's action space does not fit: ``count`` actions, or without it a box from -1 to 1.
+    ``count``: the number that the user states, or None. Raises ``InvalidInput``, with a message that begins with
+    ``who``, if the policy's action space is neither ``count`` indices nor, without ``count``, a box from -1 to 1.
     """
     space: Any = getattr(policy, "action_space", None)
     if count is None and getattr(space, "evenly_spaced", False):  # of an environment of this package
@@ -174,7 +174,7 @@ def statistics_of(model: Any) -> Any:
 def check_wrappers(policy: Any, who: str) -> None:
     """Raise ``InvalidInput`` if a model was trained under a wrapper that may change observations or actions.
 
-    Also if it was trained with ``VecNormalize``, whose statistics its file lacks.
+    The same holds for a model that was trained under ``VecNormalize`` and lacks its statistics.
     """
     env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
     for layer in [] if env is None else wrappers_of(env):
@@ -206,8 +206,8 @@ def wrappers_of(env: Any) -> Iterator[Any]:
 def _was_normalised(model: Any) -> bool:
     """Whether a model was trained on normalised observations.
 
-    Its last observation is then outside its space, or the original one is stored too (off-policy algorithms always do
-    so).
+    The last observation in training is then outside the model's observation space, or the model also stores the
+    original observation. Off-policy algorithms always store it, so it says nothing about them.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

@@ -53,10 +53,10 @@ def braking_now(speed, braking, onset, now):
 def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset, until):
     """Move a pair to its first impact, or to ``until`` (s); return its harm (m2/s2), the gap (m) and both speeds (m/s).
 
-    ``front`` and ``rear`` are the vehicles' speeds. Each coasts until its onset (s), then brakes to rest. So
-    accelerations are constant in pieces: both coast, one brakes, both brake, one stands (regimes A to C of the proof);
-    the function looks for a contact in each piece. A contact without a closing speed is no impact. If the rear vehicle
-    then presses on, they stay together: harm 0.
+    ``front`` and ``rear`` are the vehicles' speeds. Each vehicle coasts until its onset (s), then brakes to rest. So
+    the motion has phases of constant acceleration: both coast, one brakes, both brake, one stands (regimes A to C of
+    the proof); the function looks for a contact in each phase. A contact without a closing speed is no impact. If the
+    rear vehicle then brakes less than the front vehicle, they stay in contact, and the harm is 0.
     """
     now = 0.0
     while now < until:
@@ -80,9 +80,9 @@ def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset,
 
 @large
 def harm_of_deceleration(line, braking, wait, body, a):
-    """H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2).
+    """Harm H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2).
 
-    Other arguments as in ``choose_decelerations``, without the axis of worlds.
+    The other arguments are those of ``choose_decelerations`` for one world.
     """
     gap, speed, harm = line[GAP], line[SPEED], 0.0
     if body > 1:
@@ -98,9 +98,10 @@ def harm_of_deceleration(line, braking, wait, body, a):
 def find_candidates(line, braking, wait, body, at):
     """Write to ``at`` [C] the decelerations (m/s2) of vehicle ``body`` where H may be least, in one world.
 
-    Other arguments as in ``choose_decelerations``, without the axis of worlds. The formulas use the state at the
-    vehicle's onset: gap d, its speed v, the neighbour's speed u, closing speed w, and the time s for which the
-    neighbour still coasts before it brakes with b. A candidate may be invalid: outside [0, capacity], or not a number.
+    The other arguments are those of ``choose_decelerations`` for one world. The formulas use the state when the vehicle
+    begins to brake: gap d, the vehicle's speed v, the neighbour's speed u, closing speed w, and the time s for which
+    the neighbour still coasts before it brakes with b. A candidate may be invalid: outside [0, capacity], or not a
+    number.
     """
     gap, speed, onset = line[GAP], line[SPEED], wait[body]
     at[:] = 0.0
@@ -129,9 +130,9 @@ def choose_decelerations(line, braking, wait, body, at, harm, best, least):
     """Write the best deceleration of vehicle ``body`` in each world to ``best`` [n] (m/s2), and its H to ``least`` [n].
 
     ``line`` is the array of a ``State``, ``braking`` [n, N + 1] each vehicle's braking capacity or present deceleration
-    (m/s2), ``wait`` [n, N + 1] the time until it may begin to brake (s); ``at`` and ``harm`` [C] are working
-    memory. If several candidates are equally good, the result is the middle of the outer two, provided that H is as
-    small there.
+    (m/s2), ``wait`` [n, N + 1] the time until each vehicle may begin to brake (s); ``at`` and ``harm`` [C] are working
+    memory. If several candidates are equally good, the result is the middle between the smallest and the largest of
+    them if H is as small there, else the smallest.
     """
     for k in range(line.shape[0]):
         find_candidates(line[k], braking[k], wait[k], body, at)
@@ -151,9 +152,9 @@ def choose_decelerations(line, braking, wait, body, at, harm, best, least):
 
 
 def closed_form(alert: State, braking: Floats, body: int) -> ConstantDeceleration:
-    """Best deceleration of vehicle ``body``, and H, if the others brake to rest as ``braking`` says.
+    """Deceleration of vehicle ``body`` with the least predicted harm H, and H, in every world.
 
-    ``braking`` is [n, N + 1] m/s2.
+    ``braking`` [n, N + 1] (m/s2): the constant deceleration of every other vehicle, and the capacity of ``body``.
     """
     wait = np.maximum(alert.car[:, LATENCY] - alert.time_s[:, np.newaxis], 0.0)
     choice = ConstantDeceleration(np.empty(alert.n), np.empty(alert.n))
@@ -164,10 +165,10 @@ def closed_form(alert: State, braking: Floats, body: int) -> ConstantDeceleratio
 
 
 def pairwise(alert: State, body: int) -> ConstantDeceleration:
-    """Deceleration of vehicle ``body`` (1: Vehicle 1) that minimises H, and H, in every world.
+    """Deceleration of vehicle ``body`` (1: Vehicle 1) that minimises the predicted harm H, and H, in every world.
 
-    Ties, such as all decelerations that avoid both impacts, give the middle one. The result depends on gaps, speeds,
-    capacities and latencies of the vehicle and its neighbours, and ignores an obstacle.
+    Of equally good decelerations, such as all that avoid both impacts, the middle one is the result. The result depends
+    on gaps, speeds, capacities and latencies of the vehicle and its neighbours, and ignores an obstacle.
 
     Raises ``InvalidInput`` where the proof does not hold: a vehicle moves backward, or brakes build up gradually.
     """

@@ -79,11 +79,11 @@ class LearnedAgent:
             )
 
     def through(self, layers: tuple[Layer, ...]) -> LearnedAgent:
-        """The agent that observes through ``layers``."""
+        """The agent, observing the state through ``layers`` such as messages (``episode.layer``)."""
         return replace(self, observation=view_through(layers, self.observation or self.policy.observation))
 
     def begin(self, alert: State, body: int) -> None:
-        """No memory."""
+        """None, because the agent has no memory."""
 
     def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
         policy = self.policy
@@ -108,7 +108,7 @@ class PolicyAgent:
     knows: str = MESSAGES
 
     def check(self, game: Game, body: int) -> None:
-        """Raise ``InvalidInput`` if the policy may have been trained on other features than it would get here."""
+        """Raise ``InvalidInput`` if the policy may have been trained on other features than those in ``game``."""
         if self.is_assumed and game.views[body] != self.observation:
             raise InvalidInput(
                 f"agent {self.name!r}: nothing says which features the policy observes, and vehicle_{body} of scenario"
@@ -117,7 +117,7 @@ class PolicyAgent:
             )
 
     def through(self, layers: tuple[Layer, ...]) -> PolicyAgent:
-        """The agent that observes through ``layers``."""
+        """The agent, observing the state through ``layers`` such as messages (``episode.layer``)."""
         return replace(self, observation=view_through(layers, self.observation))
 
     def begin(self, alert: State, body: int) -> Any:
@@ -150,6 +150,10 @@ class PolicyAgent:
         return map_arrays(copied, memory)
 
     def _actions(self, answer: Any, state: State, body: int) -> Floats:
+        """Actions in [-1, 1], [n], from the answer of the policy.
+
+        Raises ``AgentFailed`` for a wrong shape or kind of numbers, and without ``clip`` for a number out of range.
+        """
         action_array, n, last = to_array(answer), state.n, (self.actions or 0) - 1
         kinds, low, high, right = "fiu", -1.0, 1.0, "a number in [-1, 1]"
         if self.actions is not None:
@@ -198,14 +202,15 @@ def policy_agent(
             torch module (without gradients), an ONNX session or the path of an ``.onnx`` file.
         name: name in tables; None: name of the function, class or file.
         scenario: scenario in which the policy was trained.
-        observation: features that it was trained on; None: the features named by its observation space or ONNX
+        observation: features on which the policy was trained; None: the features named by its observation space or ONNX
             metadata, or else those of ``scenario``, or else ``[own, front_1, rear_1]``.
         initial_state: number of episodes n -> first memory: an array with n rows, or a tuple of such arrays.
         clip: clip actions to [-1, 1], or indices to the valid ones; otherwise they are errors.
         actions: number of discrete actions, evenly spaced from -1 to 1, if the policy returns indices.
         ignore_wrappers: accept a model whose training environment has wrappers that may change observations or actions.
 
-    Raises ``InvalidInput`` for an unknown kind of policy, and if something would differ from its training.
+    Raises ``InvalidInput`` for an unknown kind of policy, and if observations or actions would differ from those of its
+    training.
 
     >>> import ethbrake_marl as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
@@ -243,7 +248,7 @@ def policy_agent(
 
 
 def _view(observation: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:
-    """Features that a policy observes: ``observation``, its own, or those of its training scenario's learners."""
+    """Features that a policy observes: ``observation``, or ``trained_on``, or those of learners in ``trained_in``."""
     if observation is not None:
         view = observation if isinstance(observation, View) else View(observation)
         if trained_on not in (None, view.names):

@@ -64,12 +64,12 @@ class Team(NamedTuple):
     """
 
     name: str  # in tables and messages
-    drivers: Mapping[int, Agent]  # body -> agent
+    drivers: Mapping[int, Agent]  # vehicle (1: Vehicle 1) -> agent
     shield: Shield | None = None  # it asks the drivers for proposals
 
     @staticmethod
     def of(drivers: Mapping[str, Agent], name: str, shield: Shield | None = None) -> Team:
-        """Team ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for a bad vehicle name or agent."""
+        """Team of the agents ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for a bad vehicle name or agent."""
         bodies = {}
         for vehicle, agent in drivers.items():
             if not isinstance(vehicle, str) or re.fullmatch("vehicle_[1-9][0-9]?", vehicle) is None:
@@ -79,10 +79,10 @@ class Team(NamedTuple):
         return Team(name, dict(sorted(bodies.items())), shield)
 
     def game(self, game: Game) -> Game:
-        """``game`` with this team's shield.
+        """The game with this team's shield.
 
-        Raises ``InvalidInput`` unless the team drives exactly the learners, for a shield without learners, and if the
-        game already has another shield.
+        Raises ``InvalidInput`` unless the team drives exactly the learners, if it has a shield but no learners, and if
+        the game has another shield.
         """
         driven, learners = sorted(self.drivers), sorted(game.settings.learners.tolist())
         if driven != learners:
@@ -102,7 +102,10 @@ class Team(NamedTuple):
 
 
 def check_agent(agent: Any, where: str) -> None:
-    """Raise ``InvalidInput`` unless ``agent`` has all parts of an agent; the message begins with ``where``."""
+    """Raise ``InvalidInput`` unless an agent has ``name``, ``knows``, ``begin`` and ``act``.
+
+    The message begins with ``where``.
+    """
     missing = [part for part in ("name", "knows", "begin", "act") if not hasattr(agent, part)]
     if missing:
         raise InvalidInput(
@@ -122,8 +125,9 @@ def check_knows(knows: Any, where: str) -> None:
 def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Iterator[tuple[Step | None, State]]:
     """Let a team drive the worlds ``alert`` to the end; yield each state with the step that led to it.
 
-    The first pair is ``None`` and the state at the first decision. Without a shield the agents' commands (m/s2) are
-    applied directly; a shield asks its own agents. ``donate``: each state is overwritten when the next one is computed.
+    ``alert``: worlds at the alert. The first pair is ``None`` and the state at the first decision. Without a shield the
+    agents' commands (m/s2) are applied directly; a shield asks its own agents for proposals. ``donate``: each state is
+    overwritten when the next one is computed.
     """
     if not isinstance(team, Team):
         raise InvalidInput(f"team = {team!r:.60}: must be a Team, for instance Team.of({{'vehicle_2': agent}}, 'mine')")
@@ -143,16 +147,16 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
 
 
 def play_to_end(game: Game, alert: State, team: Team) -> State:
-    """Let a team drive the worlds ``alert`` to the end; return the last state."""
+    """Let a team drive worlds from the alert to the end; return the last state."""
     for _, state in play(game, alert, team, donate=True):
         last = state
     return last
 
 
 def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
-    """Actions of the agents, [n, L] in the order of ``drivers``, and body -> new memory.
+    """Actions that agents propose, [n, L] in the order of ``drivers``, and their new memories.
 
-    ``drivers`` is body -> agent, ``memories`` body -> memory.
+    ``drivers``: vehicle (1: Vehicle 1) -> agent. ``memories``: vehicle -> memory, old and new.
     """
     actions, after = np.empty((state.n, len(drivers))), dict(memories)
     for column, (body, agent) in enumerate(drivers.items()):

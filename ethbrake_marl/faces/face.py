@@ -17,7 +17,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 
 class Face:
-    """Base class of all environments. ``bodies`` [B] are the vehicles whose observations and rewards it returns."""
+    """Base class of all environments. ``bodies`` [B]: vehicles whose observations and rewards are returned."""
 
     bodies: Ints
     episode: State = None  # type: ignore[assignment]  # until the first reset
@@ -45,16 +45,19 @@ class Face:
         return self.episode
 
     def _advance(self, actions: Floats) -> tuple[State, Step]:
-        """State after a step, and what happened in it. The running episode changes only in ``_keep``."""
+        """State after one step, and the ``Step``, for ``actions`` [n, L].
+
+        The running episode changes only in ``_keep``.
+        """
         before = self._begun("step")
         if not self.begins_again and before.clock[0, ENDED] == 1.0:
             raise InvalidInput("step: no episode is running; call reset first")
         return self.game.step(before, actions)
 
     def _keep(self, stream: Stream, state: State, show: Callable[[State], None]) -> None:
-        """Show the state (a method of the renderer), and replace the running episode and the sequence of worlds.
+        """Show the state by ``show``, a method of the renderer; replace the running episode and its sequence of worlds.
 
-        A reset or step does this last: if something fails before, it can be called again.
+        A reset or step does this last, so a call that fails earlier changes nothing and can be repeated.
         """
         show(state)
         self.stream, self.episode = stream, state
@@ -72,7 +75,7 @@ class Face:
         return self.stream.describe(self._begun("describe_worlds"))
 
     def describe_world(self) -> dict[str, Any]:
-        """``describe_worlds`` of the first world, as plain numbers and texts."""
+        """Drawn values of the first running world, as plain numbers and texts."""
         return {name: column[0].item() for name, column in self.describe_worlds().items()}
 
     def render(self) -> Any:

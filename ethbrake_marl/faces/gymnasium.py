@@ -30,7 +30,7 @@ class OneLearner(Face):
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How Gymnasium made this environment, in plain data, and the largest number of steps of an episode."""
+        """How Gymnasium made the environment: arguments as plain data, and the most steps of an episode."""
         return self._spec
 
     @spec.setter
@@ -50,6 +50,7 @@ class OneLearner(Face):
     def _open_one(
         self, game: tuple[Any, ...], render_mode: str | None, actions: int | None, most_steps: int | None
     ) -> tuple[Any, Any]:
+        """Set the game of this environment, from arguments of ``open_game``; return observation and action space."""
         self._open(open_game(*game), render_mode, most_steps)
         self.bodies, self.actions = self.game.settings.learners, actions
         names = [self.scenario.vehicle_names[i - 1] for i in self.bodies]

@@ -42,8 +42,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     all vehicles. Other counts of harm, objectives of single vehicles and other terms: ``reward``.
 
     **Start.** A world is drawn from the scenario at the alert, when Vehicle 1 begins to brake. The first observation
-    comes when the first learner's latency has elapsed. ``reset(seed=...)`` begins with the first world of the seed,
-    ``reset()`` goes on to the next one; the options of ``reset`` choose a world.
+    comes when the first learner's latency has elapsed. ``reset(seed=...)`` begins with the first world of the seed, and
+    ``reset()`` with the next world; the options of ``reset`` choose a world.
 
     **End.** All agents end together: *terminated* when every vehicle is at rest and no command would move it,
     *truncated* at the scenario's horizon. A step lasts ``time_step_s`` of the scenario, usually 0.1 s.
@@ -59,9 +59,9 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
         max_cycles: number of steps after which an episode is truncated, as at a horizon; None: only at the horizon.
-        actions: None: numbers in [-1, 1]. K >= 2: indices of K evenly spaced numbers.
-        reward_vector: None: rewards are numbers. ``vehicles``, or a list of components (``episode.terms``): rewards are
-            arrays.
+        actions: form of actions. None: numbers in [-1, 1]. K >= 2: indices of K evenly spaced numbers.
+        reward_vector: components of array rewards, ``vehicles`` or a list of names (``episode.terms``); None: rewards
+            are numbers.
         report: names of terms (``episode.terms``) whose value infos contain as ``reward_NAME``, with or without a
             weight in the reward.
 
@@ -131,7 +131,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     ) -> tuple[dict[str, Observations], Infos]:
         """Start an episode in the first world of ``seed``, or without a seed in the next world.
 
-        Options: ``{"initial_state": ...}``, or ``{"listed_world": {"seed": 7, "number": 3}}`` of an evaluation list.
+        Options choose the world: ``{"initial_state": {"gaps_m": [7, 7], ...}}``, or a world of an evaluation list,
+        ``{"listed_world": {"seed": 7, "number": 3}}``.
         """
         stream, state = self.stream.reset(1, None if seed is None else chosen_seed(seed), options)
         answer = self._observations(state), self._by_agent(self._infos(stream, state, None))
@@ -156,12 +157,12 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return answer
 
     def state(self) -> Observations:
-        """Full state of the line, [S] float32."""
+        """Full state of the line, [S] float32, in ``state_space``."""
         state_vector: Observations = full_state(self._begun("state"), *self._of_state)[0]
         return state_vector
 
     def _columns(self, actions: Mapping[str, Any]) -> Floats:
-        """Actions of the learners, [1, L]. With a shield an action may be missing: NaN."""
+        """Actions of the learners, [1, L]; NaN for a missing action, which is allowed only with a shield."""
         if not isinstance(actions, Mapping):
             raise InvalidInput(
                 f"step: actions = {actions!r}: must be a mapping from agent to action, such as {{'vehicle_2': [-1.0]}}"
@@ -191,7 +192,7 @@ parallel_env = EthBrakeParallelEnv
 
 
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> Any:
-    """Environment in PettingZoo's AEC form (agents act in turns, front to rear), made by ``parallel_env``.
+    """Environment in PettingZoo's AEC form (agents act in turns, front to rear), with arguments of ``parallel_env``.
 
     A bad action is refused at the turn of the last agent.
 

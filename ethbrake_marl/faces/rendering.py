@@ -42,7 +42,7 @@ RENDERERS: Registry[MakeRenderer] = Registry("render mode", "renderers", registe
 
 
 def why_not(mode: str, many: bool = False) -> str | None:
-    """Why a render mode cannot draw one world, or ``many``, on this machine; or None."""
+    """Why a render mode cannot draw one world (``many``: many worlds) on this machine; None if it can."""
     try:
         getattr(RENDERERS[mode], "check", bool)(many)
     except EthBrakeError as error:
@@ -59,7 +59,7 @@ def render_metadata(many: bool = False) -> dict[str, Any]:
 
 
 class Metadata:
-    """The attribute ``metadata`` of an environment's class. Packages that draw are imported when it is first read."""
+    """The attribute ``metadata`` of an environment's class. Reading it imports the packages that draw."""
 
     def __init__(self, **entries: Any) -> None:
         self.other = entries

@@ -46,13 +46,13 @@ def make_sb3_vec_env(
 ) -> EthBrakeVecEnv:
     """Environment for Stable-Baselines3 with ``n_envs`` worlds, simulated together.
 
-    It has one row for each learner of each world, world by world: ``num_envs`` is ``n_envs`` times the learners.
-    ``scenario``, ``learners``, ``reward``, ``observation``, ``actions``, ``report`` and ``max_cycles`` are as in
-    ``EthBrakeParallelEnv``.
+    It has one row for each learner of each world, world by world: ``num_envs`` is ``n_envs`` times the number of
+    learners. ``scenario``, ``learners``, ``reward``, ``observation``, ``actions``, ``report`` and ``max_cycles`` are as
+    in ``EthBrakeParallelEnv``.
 
     - ``seed``: seed of the training worlds; None: a random one.
-    - ``horizon_is_end``: report an episode that reaches the horizon as ended, not as truncated. Harm after the horizon
-      is not counted, so a bootstrapped value of it could grow without limit.
+    - ``horizon_is_end``: report an episode that reaches the horizon as terminated, not as truncated. Harm after the
+      horizon is not counted, so values bootstrapped beyond it could grow without limit.
     - ``appended``: numbers after each observation: the learner's ``number`` in its world, from 0, or the full
       ``state``.
     - ``step_infos``: return infos at every step, not only at the last one.
@@ -72,7 +72,7 @@ def make_sb3_vec_env(
 class EthBrakeVecEnv(Face, VecEnv):
     """Vector environment of Stable-Baselines3: row ``k L + l`` is learner l of L (front to rear) in world k.
 
-    The rows of a world share an episode. Infos at its last step include ``TimeLimit.truncated``,
+    The rows of a world share an episode. Infos at the last step of an episode include ``TimeLimit.truncated``,
     ``terminal_observation`` and ``episode`` (return ``r``, steps ``l``, and ``t``, always 0). ``reset_infos`` belong to
     the first decision of each running episode. All rows have the same seed, options and attributes.
 
@@ -111,6 +111,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         self.seed(seed)
 
     def _features(self) -> tuple[Feature, ...]:
+        """Features of a row: those that all learners observe, and the appended numbers."""
         views = {self.game.views[i] for i in self.bodies}
         if len(views) > 1:
             raise InvalidInput(
@@ -132,7 +133,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         return self._seeds
 
     def reset(self) -> Observations:
-        """Start an episode in every world: the next worlds, or those of ``set_options``."""
+        """Start an episode in every world: the next worlds of the seed, or those that ``set_options`` chose."""
         options = self._options
         if options != options[:1] * self.num_envs:
             self._reset_options()
@@ -178,7 +179,10 @@ class EthBrakeVecEnv(Face, VecEnv):
         return observations, reward.astype(np.float32), over, infos
 
     def _last_infos(self, state: State, step: Step, ended: Any) -> list[dict[str, Any]]:
-        """Infos of each learner of the worlds ``ended`` (indices), whose last ``step`` led to ``state``."""
+        """Infos of each learner at the end of an episode, in the worlds ``ended`` (indices).
+
+        ``step``: last step of all worlds, which led to ``state``.
+        """
         terms = {name: term[ended] for name, term in step.terms.items()}
         step = step._replace(reward=step.reward[ended], out=step.out[:, ended], terms=terms)
         cut = (step.truncated & (not self.horizon_is_end)).repeat(len(self.bodies)).tolist()
@@ -197,6 +201,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         """Ignore the empty infos of Stable-Baselines3's constructor."""
 
     def _observe(self, state: State) -> Observations:
+        """Observations of all rows, with the appended numbers, [n L, F] float32."""
         L, every = len(self.bodies), self.game.observe_alike(state, self.bodies)
         rows: Observations = every.reshape(-1, every.shape[2])
         if self.appended is None:
@@ -234,7 +239,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Call a method once; return its result once per row. Raises ``InvalidInput`` if ``indices`` lack a row."""
+        """Call a method once; return its result once per row. Raises ``InvalidInput`` if ``indices`` omit a row."""
         self._refuse_some_rows("env_method", indices)
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
 

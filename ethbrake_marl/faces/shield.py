@@ -38,17 +38,17 @@ def shield(
 
     Args:
         env: an environment of this package (perhaps in wrappers of its library), a ``VecEnv``, a ``Team`` or an agent.
-        policy: proposes where the caller does not (NaN, or no entry in the dictionary); the shield also plans with it.
-            A name, an agent for all learners, a ``Team``, or vehicle -> agent. None: the shield then follows its own
-            plan.
+        policy: proposes actions where the caller proposes none (NaN, or no entry in the dictionary); the shield also
+            plans with them. A name, an agent for all learners, a ``Team``, or vehicle -> agent. None: without a
+            proposal the shield follows its own plan.
         mode: ``step``, ``episode`` (the paper's Algorithm 1), or another shield, as after the ``+`` in an agent's name.
         scenario: scenario in which an agent drives; only for agents.
-        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``). None: the count of the
+        harm_count: harm to bound: ``first``, ``total`` or ``honest`` (``episode.counts``). None: the count of the
             environment's reward, or ``first`` for an agent.
-        options: of the mode: ``allowance`` (m2/s2) and ``cap`` (None or ``baseline``) for ``step``, ``bound``
+        options: settings of the mode: ``allowance`` (m2/s2) and ``cap`` (None or ``baseline``) for ``step``, ``bound``
             (``coupled`` or ``pairwise``) for ``episode``.
 
-    Raises ``InvalidInput`` for anything else, and for an environment that already has a shield.
+    Raises ``InvalidInput`` for any other ``env`` or setting, and for an environment that already has a shield.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
@@ -85,7 +85,7 @@ def guard_team(team: Team, mode: str, scenario: Scenario | None, harm_count: str
 
 
 def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Team], Team], harm_count: str) -> Any:
-    """Shielded copy of an environment. If ``policy`` is a name, its agent minimises ``harm_count``.
+    """Shielded copy of an environment. If ``policy`` is the name of an agent, this agent minimises ``harm_count``.
 
     ``base`` is ``env`` without wrappers; ``around`` puts the shield around a team.
     """

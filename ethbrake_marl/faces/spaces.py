@@ -15,9 +15,9 @@ from ethbrake_marl.motion.layout import Floats
 
 
 def feature_box(features: Sequence[Feature]) -> Box:
-    """Float32 box with the names of its entries in ``features``, which is saved with a model.
+    """Float32 box of observations. Its attribute ``features`` names its entries, and is saved with a model.
 
-    The box is a plain one, because libraries look up the exact class of a space.
+    The class is ``Box`` itself, because libraries look up the exact class of a space.
     """
     low, high = (np.array([getattr(f, end) for f in features], np.float32) for end in ("low", "high"))
     box = Box(low, high, dtype=np.float32)
@@ -33,7 +33,7 @@ def reward_box(components: Sequence[Any]) -> Box:
 def action_space(count: int | None) -> Any:
     """Action space of one learner: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices.
 
-    Indices stand for evenly spaced actions, as the attribute ``evenly_spaced`` of their space says.
+    The indices stand for evenly spaced actions; the space has an attribute ``evenly_spaced`` that says so.
     """
     if count is None:
         return Box(-1.0, 1.0, (1,), np.float32)
@@ -44,7 +44,7 @@ def action_space(count: int | None) -> Any:
 
 
 def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, count: int | None = None) -> Floats:
-    """Actions as float64 of ``shape``; the input may lack axes of length 1, or have more.
+    """Actions as a float64 array of ``shape``. The input may have more or fewer axes of length 1.
 
     Index k of ``count`` stands for ``(2 k - count + 1) / (count - 1)``. Raises ``InvalidInput`` for a wrong shape or
     index, and for values that are not numbers. The range [-1, 1] is checked later, in ``Game.step``.

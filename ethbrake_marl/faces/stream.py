@@ -26,9 +26,9 @@ class UnknownResetOption(UserWarning):
 
 
 class Stream(NamedTuple):
-    """The training worlds of a seed, one after the other. World k of a seed is always the same, in any row.
+    """The training worlds of a seed, one after the other. World k of a seed is the same in every row.
 
-    It is never changed: who begins episodes gets the stream of the worlds that follow.
+    A stream never changes. A method that begins episodes also returns a new stream, of the worlds that follow.
     """
 
     scenario: Scenario
@@ -40,11 +40,11 @@ class Stream(NamedTuple):
     )
 
     def reset(self, n: int, seed: Any, options: Any = None) -> tuple[Stream, State]:
-        """New episodes in the first n worlds of ``seed``, or in the next n worlds if it is None.
+        """Stream of the worlds that follow, and new episodes in the first n worlds of a seed.
 
-        A list has the seed of each row, which begins with the first world of its own seed. The first reset without a
-        seed draws a random one. ``options`` may specify the worlds instead. Raises ``InvalidInput`` for a bad seed or
-        option; warns of unknown options.
+        Without a seed the next n worlds begin; the first reset without a seed draws a random one. With a list of n
+        seeds each row begins with the first world of its own seed. ``options`` may specify the worlds instead. Raises
+        ``InvalidInput`` for a bad seed or option; warns of unknown options.
         """
         chosen, first = self.seed, self.next
         if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
@@ -60,21 +60,24 @@ class Stream(NamedTuple):
         return self._replace(seed=chosen, next=after, option_worlds=option_worlds), self.game.reset(worlds)
 
     def next_episodes(self, rows: Ints) -> tuple[Stream, State]:
-        """New episodes in the next world of each row. They share no memory with other episodes."""
+        """Stream of the worlds that follow, and a new episode for each of ``rows``, in its next world.
+
+        The new episodes share no arrays with others.
+        """
         worlds, after = self._draw(rows, self.seed, self.next)
         return self._replace(next=after), self.game.reset(worlds)
 
     def _draw(self, rows: Ints, seed: Any, first: Any) -> tuple[State, Any]:
-        """Next world of each row, and ``next`` after it."""
+        """Next world of each of ``rows``, and the value of ``next`` after it."""
         if isinstance(seed, int):
             return self.game.draw(len(rows), seed, first), first + len(rows)
         row_worlds = [self.scenario.sample(1, int(seed[k]), first=int(first[k]), purpose="training") for k in rows]
         return State.join(row_worlds), first + np.isin(np.arange(len(first)), rows)
 
     def seeds_of(self, state: State, rows: Any = slice(None)) -> Any:
-        """Seed of each world of ``rows``, whose episodes are ``state``, or of all.
+        """Seed of each running world, or of the worlds of ``rows``; -1 for a world that the caller supplied.
 
-        It is -1 for a world that the caller made.
+        ``state``: state of these worlds.
         """
         seed = self.seed if isinstance(self.seed, int) else np.asarray(self.seed)[rows]
         return (
@@ -94,7 +97,7 @@ class Stream(NamedTuple):
         return {**columns, "world_seed": names["world_seed"], "world": names["world"]}
 
     def _worlds_of_options(self, n: int, options: Any) -> tuple[DrawnWorlds, int] | None:
-        """Worlds that ``options`` of a reset specify, and their seed or -1; or None."""
+        """Worlds that ``options`` of a reset specify, and their seed (-1: no seed); None if there are none."""
         if options is None:
             return None
         if not isinstance(options, Mapping):
@@ -126,7 +129,7 @@ class Stream(NamedTuple):
 
 
 def chosen_seed(seed: int | None) -> int:
-    """Seed, or for None a random one of 63 bits. Raises ``InvalidInput`` for a bad seed."""
+    """The seed, or a random seed of 63 bits for None. Raises ``InvalidInput`` for a bad seed."""
     if seed is None:
         return int.from_bytes(np.random.SeedSequence().generate_state(2).tobytes(), "little") % 2**63
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:

@@ -34,7 +34,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         render_mode: a mode of ``metadata["render_modes"]``; ``render`` returns one picture per world.
         autoreset_mode: Gymnasium's ``NextStep`` (the step after the last one of an episode starts the next episode,
             ignores the action and has reward 0) or ``SameStep``.
-        max_episode_steps: as ``max_cycles`` there.
+        max_episode_steps: as ``max_cycles`` in ``EthBrakeParallelEnv``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np

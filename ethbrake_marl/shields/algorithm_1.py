@@ -1,8 +1,9 @@
 """The paper's hybrid (Algorithm 1): at the alert, either a policy or E-V2X-BM gets the whole episode.
 
-It compares H(policy's rollout) with H*, the harm of E-V2X-BM's constant deceleration, and takes the smaller. With the
-coupled H*, the harm of the episode is this smaller one to the last bit, if the policy is deterministic. The paper's own
-pairwise H* bounds nothing: it is about half of the harm that this deceleration does.
+It compares the harm of the policy's rollout with H*, the harm of E-V2X-BM's constant deceleration, and chooses the
+driver with the smaller harm. With H* of ``coupled``, the harm of the episode is the smaller of the two, to the last
+bit, if the policy is deterministic. The paper's own H*, of ``pairwise``, bounds nothing: it is about half of the harm
+that the deceleration does.
 """
 
 from __future__ import annotations
@@ -39,16 +40,16 @@ class EpisodeShieldMemory(NamedTuple):
     agent: Any  # memory of the policy
     proposed: Floats  # [n, 1] last proposal
     applied: Floats  # [n, 1] last action
-    intervened: Bools  # [n, N] whether they differ
+    intervened: Bools  # [n, N] whether proposal and action differ
 
 
 class EpisodeShield:
-    """Algorithm 1 for one learner. Actions proposed from outside have no effect.
+    """Algorithm 1 of the paper, for one learner. Actions that the caller proposes have no effect.
 
     Args:
-        drivers: body of the learner -> its policy.
-        harm_count: what is compared: ``first``, ``total`` or ``honest`` (``episode.counts``).
-        bound: H*: ``coupled`` (the episode's own physics) or ``pairwise`` (the paper's closed form).
+        drivers: the learner's vehicle (1: Vehicle 1) -> its policy.
+        harm_count: harm to compare: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        bound: how H* is computed: ``coupled`` (the episode's own physics) or ``pairwise`` (the paper's closed form).
 
     """
 
@@ -66,7 +67,7 @@ class EpisodeShield:
             )
 
     def begin(self, game: Game, alert: State, state: State) -> EpisodeShieldMemory:
-        """Memory at the first decision ``state``: which driver gets each episode."""
+        """Memory at the first decision: whether the policy or E-V2X-BM drives each world."""
         check_drivers(game, self.drivers)
         ((body, agent),) = self.drivers.items()
         remembered = begin_script(game.agents({body: agent})[body], alert, body)

@@ -1,7 +1,7 @@
-"""Plans that a shield may try: after an action, and where nobody proposes one.
+"""Plans that a shield may try: at the alert, and as ways to continue after a proposed action.
 
-A plan [n, T, L] has the learners' actions at every decision. The bound does not depend on this file: the shield
-computes the harm of each plan before it follows it.
+A plan [n, T, L] has the L learners' actions at every decision. The bound does not depend on this file: the shield
+computes the harm of each plan before it follows the plan.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from ethbrake_marl.episode.hold import descend, hold
 from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.motion.layout import Floats
 
-BRAKE_SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
-FALLBACK_ROUNDS = 2  # in which they try them
-CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4])  # of the plan's next actions, tried as constants
+BRAKE_SHARES = np.linspace(0.0, 1.0, 21)  # shares of its brakes that each of several learners tries at the alert
+FALLBACK_ROUNDS = 2  # rounds in which the learners take turns to try them
+CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4])  # added to the plan's next actions, then held
 SINGLE_ACTIONS = np.linspace(0.0, -1.0, 4)  # actions of one of several learners, tried while the others follow the plan
 
 
 def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
     """Plans of constant actions from which a shield chooses at the alert, [n, T, L] each.
 
-    One learner: E-V2X-BM. Several: full braking; E-V2X-BM of one learner while the others brake fully; and each
-    learner's best share of its brakes, chosen one after the other.
+    With one learner: E-V2X-BM. With several: E-V2X-BM of each learner while the others brake fully; the best share of
+    each learner's brakes, chosen one learner after the other; and full braking of all.
     """
     learners, n, until_s = game.settings.learners, state.n, state.clock[:, END]
     full = alert._replace(wanted=state.wanted.copy())
@@ -52,11 +52,11 @@ def constant_plans(game: Game, actions: Floats) -> Floats:
 
 
 def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
-    """Constant actions that do the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
+    """Constant actions with the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
 
-    It tries the next actions of ``plans`` [n, T, L], all of them harder or softer by the same ``CHANGES``, and, with
-    several learners, one learner's other actions while the rest follow the plan. ``states`` may have several possible
-    states of each world, one after the other: then the largest harm counts.
+    Candidates are the next actions of ``plans`` [n, T, L] with one of ``CHANGES`` added to all of them; with several
+    learners also each of ``SINGLE_ACTIONS`` for one learner while the others hold the plan's next actions. ``states``
+    may contain several possible states of each world, in consecutive rows; then the largest of their harms counts.
     """
     learners, rows, states_per_world = game.settings.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
     planned = plans[rows, np.minimum(states.steps[::states_per_world], plans.shape[1] - 1)]
@@ -76,8 +76,9 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
 def rollout(
     game: Game, drivers: Mapping[int, Agent], state: State, plans: Floats, count: str, most: Any = np.inf
 ) -> Floats:
-    """``plans`` with the actions of agents that drive from ``state`` on, until the harm is above ``most`` [n].
+    """Copy of ``plans`` [n, T, L] with the actions that agents choose from ``state`` on.
 
+    Agents drive until the episode ends or its harm is above ``most`` [n] (m2/s2). ``drivers``: vehicle -> agent;
     ``state`` contains the agents' memories.
     """
     plans, rows, drivers = plans.copy(), np.arange(state.n), game.agents(drivers)

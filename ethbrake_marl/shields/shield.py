@@ -1,4 +1,4 @@
-"""What all shields share: how a name makes one, checks, the reasons that they report, and a reward term."""
+"""What all shields share: how a name becomes a shield, checks, reasons in the infos, and a reward term."""
 
 from __future__ import annotations
 
@@ -44,15 +44,18 @@ class ShieldReason(IntEnum):
 
 
 class NamedShield(NamedTuple):
-    """Makes a shield of one class for a team. Text after the colon of its name sets the option ``argument``."""
+    """Makes a shield of one class for a team.
+
+    In a shield's name ``NAME:TEXT``, ``TEXT`` becomes the option whose name is in the field ``argument``.
+    """
 
     shield: Callable[..., Shield]  # (drivers, harm_count=..., **options); one called ``scenario`` is the worlds'
     argument: str | None = None  # the option that is the text after the colon
 
     def __call__(self, team: Team, text: str | None, settings: Any) -> Team:
-        """Team with the shield. Raises ``InvalidInput`` for bad options, and for a team that has a shield.
+        """The team with the shield. Raises ``InvalidInput`` for bad options, and for a team that already has a shield.
 
-        ``text`` follows the colon of the shield's name; ``settings`` are ``names.AgentSettings``.
+        ``text``: the part of the shield's name after the colon, or None. ``settings``: ``names.AgentSettings``.
         """
         if team.shield is not None:
             raise InvalidInput(f"shield: team {team.name!r} already has a shield")
@@ -88,7 +91,7 @@ def check_harm_count(count: str) -> None:
 
 
 def spread(game: Game, state: State, columns: Any, script_value: Any = 0) -> Any:
-    """Values of all vehicles, [n, N]: those of learners from ``columns`` [n, L], and ``script_value`` for scripts."""
+    """Values of all vehicles, [n, N]: ``columns`` [n, L] for the learners, ``script_value`` for the other vehicles."""
     wide = np.full((state.n, state.vehicles), script_value, columns.dtype)
     wide[:, game.settings.learners - 1] = columns
     return wide

@@ -92,8 +92,9 @@ class StepShield:
     """The step shield of all learners of a game.
 
     Args:
-        drivers: body -> agent, for a shield that proposes actions itself or simulates its agents; may be empty.
-        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        drivers: vehicle (1: Vehicle 1) -> agent. They propose where the caller does not, and the shield plans with
+            them; None: no agents.
+        harm_count: harm to bound: ``first``, ``total`` or ``honest`` (``episode.counts``).
         allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
         cap: ``baseline``: no vehicle bears more harm than under the best constant actions at the alert; None: no caps.
 
@@ -122,14 +123,14 @@ class StepShield:
     # A subclass for worlds that may be in one of M states overrides the next two; ``first_memory`` gets the states.
 
     def possible_states(self, state: State, memory: StepShieldMemory) -> State:
-        """M possible states of each world, M rows per world, the nominal one first. Here M = 1."""
+        """Possible states of each world, in M consecutive rows, the nominal state first. Here M = 1."""
         return state
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
         """Harm of each plan, [n] m2/s2: the largest over the M possible states of a world.
 
-        A simulation stops where its harm is above ``most``. The harm is infinite if a vehicle would bear more than its
-        cap (``caps`` [n, N] m2/s2).
+        ``states`` has M rows per world; ``plans`` is [n, T, L]. A simulation stops when its harm is above ``most``. The
+        harm is infinite if a vehicle would bear more than its cap (``caps`` [n, N] m2/s2).
         """
         last, harm = follow_plans(game, states, plans, self.count, most)
         if caps is not None:
@@ -137,7 +138,7 @@ class StepShield:
         return harm
 
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
-        """Plans in which the shield's agents drive on until the harm is above ``most`` [n]."""
+        """Copy of ``plans`` in which the shield's agents drive from ``state`` until the harm is above ``most`` [n]."""
         return rollout(game, self.drivers, state, plans, self.count, most)
 
     def bound(self, memory: StepShieldMemory) -> Floats:
@@ -153,16 +154,17 @@ class StepShield:
         return first_plans(game, alert, state, self.count)
 
     def cheapest(self, game: Game, states: State, plans: list[Floats]) -> tuple[Floats, Floats]:
-        """Plan with the smallest price in each world, and this price, [n] m2/s2."""
+        """Plan with the smallest price in each world, [n, T, L], and this price, [n] m2/s2."""
         prices = np.stack([self.price(game, states, plan) for plan in plans])
         return np.stack(plans)[prices.argmin(axis=0), np.arange(prices.shape[1])], prices.min(axis=0)
 
     def first_memory(
         self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]
     ) -> StepShieldMemory:
-        """Memory at the first decision; its plan is the best constant actions or the agents' rollout.
+        """Memory at the first decision; its plan is the agents' rollout, or constant actions if they cost less.
 
-        ``states`` are the possible states (``possible_states``), ``agents`` body -> memory at the alert.
+        ``alert`` and ``state``: worlds at the alert and at the first decision. ``states``: their possible states
+        (``possible_states``). ``agents``: vehicle -> memory at the alert.
         """
         plan, harm = self.cheapest(game, states, self.plans(game, alert, state, states))
         caps = follow_plans(game, state, plan, self.count)[0].borne_harm(self.count) if self.cap else None
@@ -184,6 +186,11 @@ class StepShield:
     def decide(
         self, game: Game, state: State, proposed: Floats | None, *, donate: bool
     ) -> tuple[Floats, StepShieldMemory]:
+        """Actions to apply, [n, L], and the new memory: accepted proposals, or else the plan's actions.
+
+        ``proposed`` [n, L]: NaN for no proposal; None: the shield's agents propose. ``donate``: the old memory may be
+        overwritten.
+        """
         memory: StepShieldMemory = state.memories["shield"]
         proposed, state = self.collect_proposals(game, state, proposed)
         if not donate:
@@ -220,10 +227,10 @@ class StepShield:
         )  # fmt: skip
 
     def collect_proposals(self, game: Game, state: State, proposed: Floats | None) -> tuple[Floats, State]:
-        """Proposals [n, L], NaN for none, and the state with the new memories of the shield's agents.
+        """Proposed actions, [n, L] (NaN: none), and the state with the new memories of the shield's agents.
 
-        The agents propose where nobody else does. An agent with a memory is asked at every decision, so it stays up to
-        date.
+        The agents propose where the caller does not. An agent with a memory is asked at every decision, to keep its
+        memory up to date.
         """
         memories = {who: memory for who, memory in state.memories.items() if who != "shield"}
         agent_memories = dict(zip(self.drivers, state.memories["shield"].agents, strict=True))
@@ -248,11 +255,11 @@ class StepShield:
         now: Ints,
         rests: list[Fallback],
     ) -> tuple[Ints, Floats]:
-        """Store, in each world of ``rows``, a plan that begins with ``actions`` and keeps the bound, if one is found.
+        """Search, in R worlds, for plans that begin with ``actions`` and keep the bound; store them in ``memory``.
 
-        ``actions`` [len(rows), L] belong to decision ``now`` [len(rows)] of the plan. It tries the rest of the present
-        plan first, then the fallbacks ``rests``. Returns the reasons, and the smallest price or estimate among the
-        plans tried, [len(rows)] each.
+        ``rows`` [R]: the worlds. ``actions`` [R, L]: actions at the decision with the number ``now`` [R]. The rest of
+        the present plan is tried first, then the fallbacks ``rests``. Returns the reasons, and the smallest price or
+        estimate among the plans tried (m2/s2), [R] each.
         """
         most, plans = self.bound(memory)[rows], memory.plan[rows]
         plans[np.arange(len(rows)), now] = actions
@@ -312,24 +319,24 @@ def take_worlds(states: State, rows: Ints, M: int) -> State:
 
 @cache
 def trials(learners: int) -> Bools:
-    """Which of the L proposals each trial includes, [1 + L, L]: all, then one by one; [1, 1] for one learner."""
+    """Mask of the trials, [1 + L, L]: first all learners' proposals, then each learner's alone. [1, 1] if L = 1."""
     alone = np.eye(learners, dtype=np.bool_)
     return alone if learners == 1 else np.concatenate([alone.any(axis=0, keepdims=True), alone])
 
 
 def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
-    """Fallback of ``accept``: return plans that go on with the best constant actions, and an estimate of their harm.
+    """Fallback of ``accept``: plans that continue with the best constant actions, and an estimate of their harm.
 
-    It is 0 (unknown) if scripts look at the state.
+    The estimate is 0 (unknown) if scripts look at the state.
     """
     plans, estimate = best_constant(game, after, plans, shield.count)
     return plans, np.zeros(len(plans)) if game.scripts else estimate
 
 
 def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
-    """Fallback of ``accept``: return plans in which the shield's agents drive on from ``after``.
+    """Fallback of ``accept``: plans in which the shield's agents drive from the states ``after`` on.
 
-    The other result, an estimate of their harm, is 0 (unknown).
+    The second result, an estimate of the plans' harm, is 0 (unknown).
     """
     nominal = after if after.n == len(plans) else after.take(np.arange(0, after.n, after.n // len(plans)))
     return shield.rolled_out(game, nominal, plans, most), np.zeros(len(plans))

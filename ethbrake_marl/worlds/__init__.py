@@ -1,1 +1,1 @@
-"""Worlds: scenario files, and the worlds that are drawn from a scenario or given by the user."""
+"""Worlds: scenario files, and the worlds that are drawn from a scenario or supplied by the user."""

@@ -1,4 +1,4 @@
-"""The catalogue of scenarios: shipped and registered ones by name, other files by path."""
+"""The catalogue of scenarios: shipped and registered scenarios by name, other scenario files by path."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class CatalogueEntry:
 
 
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
-    """Folder of the shipped scenarios or recipes (``train``), in the checkout or the installed package."""
+    """Folder of the shipped scenarios or training recipes (``train``), in a source checkout or an installed package."""
     checkout = _PACKAGE.parent / folder
     return checkout if (_PACKAGE.parent / "pyproject.toml").is_file() else _PACKAGE / "_data" / folder
 
 
 def register_scenarios(folder: str | os.PathLike[str]) -> None:
-    """Register the scenarios in a folder: its file ``my-name.yaml`` becomes ``--scenario my-name``.
+    """Register the scenario files in a folder: the file ``my-name.yaml`` becomes the scenario ``my-name``.
 
     Files are checked only when used. Raises ``InvalidInput`` for a folder without YAML files, and ``AlreadyExists`` for
     a name in use.
@@ -65,10 +65,10 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
 
 
 def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenario:
-    """Load a scenario by its name, by the path of its file (``scenario_path``), or from a file's content.
+    """Load a scenario from its name, from the path of its file, or from the content of such a file.
 
-    Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` with file, line, key and value for a bad file, or
-    one whose key ``name`` differs from its file name.
+    Raises ``UnknownName`` for an unknown name. Raises ``InvalidInput`` for a bad file (with file, line, key and value),
+    and for a file whose key ``name`` differs from the file's own name.
     """
     if isinstance(scenario, Scenario):
         return scenario
@@ -78,7 +78,7 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
 
 
 def _load(path: Path, above: tuple[Path, ...]) -> Scenario:
-    """``above``: the files that are based on this one, each on the next."""
+    """Load the scenario file ``path``. ``above``: chain of files that need it; each of them needs the next one."""
     document = read_yaml(path)
     loaded = _build_scenario(document, path.parent, (*above, path))
     if loaded.name != path.stem:
@@ -90,10 +90,11 @@ def _load(path: Path, above: tuple[Path, ...]) -> Scenario:
 
 
 def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
-    """Path of a scenario's file, which need not exist.
+    """Path of a scenario's file.
 
-    A text that ends in ``.yaml`` or ``.yml`` is a path. Otherwise it is a shipped or registered name, or else
-    ``my/folder/mine`` stands for ``my/folder/mine.yaml`` or ``mine.yml`` below ``folder``.
+    A text that ends in ``.yaml`` or ``.yml`` is a path relative to ``folder``; the file need not exist. Any other text
+    is the name of a shipped or registered scenario, or else the path of an existing file without its ending. Raises
+    ``UnknownName`` if it is neither.
     """
     text, paths = str(name_or_path), _known_paths()
     path = folder / Path(text).expanduser()
@@ -108,7 +109,7 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
 
 
 def group_of_scenarios(name: str) -> list[str]:
-    """Names in a group: ``benchmark``, or a folder of shipped scenarios; [] for an unknown group."""
+    """Names of the scenarios in a group: ``benchmark``, or a folder of shipped scenarios; [] for an unknown group."""
     if name == "benchmark":
         return list(BENCHMARK)
     return sorted(path.stem for path in shipped_folder().glob("*/*.yaml") if path.parent.name == name)
@@ -131,6 +132,11 @@ def _known_paths() -> dict[str, Path]:
 
 
 def _build_scenario(document: Document, folder: Path, above: tuple[Path, ...]) -> Scenario:
+    """Scenario from a parsed file, completed from the other files that its keys name.
+
+    These are the scenario after ``based_on``, the members of a mixture and the CSV file of a table; paths are relative
+    to ``folder``. ``above``: as in ``_load``. Raises ``InvalidInput`` for a key that repeats a value of the base.
+    """
     content, base = document.content, None
     if isinstance(content, dict) and "based_on" in content:
         base = _base(document, content["based_on"], folder, above)
@@ -166,7 +172,7 @@ def _base(document: Document, name: Any, folder: Path, above: tuple[Path, ...]) 
 
 
 def _load_below(what: str, path: Path, above: tuple[Path, ...]) -> Scenario:
-    """Load a scenario that the last file of ``above`` needs. Raises ``InvalidInput`` if it is one of these files."""
+    """Load the file ``path``, which the last file of ``above`` needs. Raises ``InvalidInput`` if it is one of them."""
     places = [file.resolve() for file in above]
     if path.resolve() in places:
         circle = " -> ".join(file.stem for file in (*above[places.index(path.resolve()) :], path))
@@ -175,6 +181,7 @@ def _load_below(what: str, path: Path, above: tuple[Path, ...]) -> Scenario:
 
 
 def _member(document: Document, i: int, entry: Any, folder: Path, above: tuple[Path, ...]) -> Any:
+    """Entry ``i`` of a mixture in which a scenario's name or path is replaced by the content of its file."""
     if not isinstance(entry, dict) or "scenario" not in entry:
         return entry
     at: YamlPath = ("mixture", i, "scenario")
@@ -187,6 +194,7 @@ def _member(document: Document, i: int, entry: Any, folder: Path, above: tuple[P
 
 
 def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> Any:
+    """Content of a scenario in which the name of the table's CSV file is replaced by the rows of this file."""
     table = content.get("table") if isinstance(content, dict) else None
     if not (isinstance(table, dict) and isinstance(table.get("file"), str)) or "rows" in table:
         return content

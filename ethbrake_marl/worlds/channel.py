@@ -13,7 +13,8 @@ drawn from ``sensing_s``.
 
 Vehicle i can react from ``latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))`` on: its own
 latency is over, and it has the message of Vehicle 1 or has seen the vehicle ahead brake. It reacts to vehicle j from
-``max(latency_i, min(tau_ij, hop_ij))`` on. With the preset ``paper`` it knows everything once its own latency is over.
+``max(latency_i, min(tau_ij, hop_ij))`` on. With the preset ``paper`` a vehicle knows everything once its own latency is
+over.
 """
 
 from __future__ import annotations
@@ -69,10 +70,10 @@ class Equipage(ScenarioPart):
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
-    """Number k of periods that a burst of losses lasts, for uniform numbers ``u``.
+    """Number k of message periods that a burst of losses lasts, for each of the uniform numbers ``u`` in [0, 1).
 
     With p = ``loss_begins`` and r = ``loss_ends``, k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``.
-    Without a logarithm every machine gets the same k.
+    The computation needs no logarithm, so every machine gets the same k.
     """
     bound, bounds = loss_begins / (loss_begins + loss_ends), []
     while bound > 2.0**-53:
@@ -83,7 +84,7 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
 
 
 class Extension:
-    """What an extension adds to the V2X channel, declared by keys of ``v2x``. Override the methods that differ.
+    """Base class of extensions of the V2X channel, which add keys to ``v2x``. Override the methods that differ.
 
     >>> from ethbrake_marl.episode.layer import Layer
     >>> from ethbrake_marl.worlds.channel import Extension
@@ -98,11 +99,11 @@ class Extension:
     schemas: Mapping[str, JsonSchemaValue]  # JSON schema of each key, with a description
 
     def read(self, key: str, value: Any) -> Any:
-        """Value of a key as plain data. Refuses a bad value (``files.model.refuse``)."""
+        """Checked value of a key, as plain data. Refuses a bad value (``files.model.refuse``)."""
         return value
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Keys about messages that have an effect with this extension. Keys without any effect are refused."""
+        """Keys in ``OF_MESSAGES`` that have an effect with this extension. A key without any effect is refused."""
         return ()
 
     def is_random(self, v2x: V2X) -> bool:
@@ -110,12 +111,13 @@ class Extension:
         return False
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse a scenario that cannot have these keys."""
+        """Refuse a scenario in which the keys of this extension make no sense."""
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Any:
-        """Memory of this extension for n worlds at the alert: None, an array with one row per world, or a tuple.
+        """Memory of this extension for n worlds at the alert: None, an array with n rows, or a tuple of such arrays.
 
-        ``numbers`` draws random numbers (``counters.uniform_numbers``); ``unheard``: as in ``V2X.heard_and_seen``.
+        ``numbers``: source of random numbers (``counters.uniform_numbers``). ``unheard`` [n or 1, N, N]: whether the
+        vehicles' equipment excludes messages of vehicle j (last axis) to vehicle i.
         """
 
     def layer(self, v2x: V2X) -> Layer:
@@ -184,6 +186,7 @@ class V2X(ScenarioPart):
     @model_validator(mode="wrap")
     @classmethod
     def _with_preset(cls, value: Any, build: ModelWrapValidatorHandler[Self]) -> Self:
+        """Build the channel from a preset's name, or from a mapping in which missing keys take the preset's values."""
         if isinstance(value, V2X):
             return build(value)
         name = value.get("preset", "paper") if isinstance(value, dict) else value
@@ -206,7 +209,7 @@ class V2X(ScenarioPart):
 
     @model_serializer(mode="wrap")
     def _as_written(self, dump: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
-        """Keys of the file; keys that the preset sets are null or left out."""
+        """Settings that the scenario file contains. Those that only the preset sets are None or left out."""
         with_defaults = not (info.exclude_unset or info.exclude_none)
         return {
             key: setting if key in self._keys else None
@@ -262,7 +265,7 @@ class V2X(ScenarioPart):
 
     @property
     def by_link(self) -> bool:
-        """Whether the channel is not the paper's, in which each vehicle knows everything after its own latency."""
+        """Whether links matter. In the paper's channel they do not: a vehicle knows all after its own latency."""
         return self.timing != "latency" or (self.hears, self.senses, self.lost) != ("all", "none", 0.0)
 
     @property
@@ -274,7 +277,10 @@ class V2X(ScenarioPart):
         return random_extensions or (self.by_link and (random_messages or random_sensing))
 
     def first_message_s(self, u: Floats) -> Floats:
-        """Delay tau of each link's first message (s), for uniform numbers ``u`` [..., PER_LINK]; infinite: none."""
+        """Delay tau of the first message on each link (s since the alert), for uniform numbers ``u`` [..., PER_LINK].
+
+        Infinite: the link never delivers. Minus infinite: only the receiver's latency matters.
+        """
         delay = np.full(u.shape[:-1], -np.inf if self.link_latency_s is None else self.link_latency_s)
         if self.timing == "messages":
             periods = burst_periods(u[..., 1], self.loss_begins, self.loss_ends)
@@ -284,10 +290,10 @@ class V2X(ScenarioPart):
         return delay
 
     def heard_and_seen(self, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
-        """Time until i can use the first message of j, and delay until i sees j, [n, N, N] s each.
+        """Time from which vehicle i can use messages of vehicle j, and delay until i sees j, [n, N (i), N (j)] s each.
 
-        ``u`` [n, PER_LINK N^2] are uniform numbers for the links. ``unheard`` [n or 1, N, N] says which links the
-        vehicles' equipment excludes (``Scenario.unheard``). Infinite: never. Minus infinite: at once.
+        ``u`` [n, PER_LINK N^2]: uniform numbers of the links. ``unheard`` [n or 1, N, N]: whether the vehicles'
+        equipment excludes the link (``Scenario.unheard``). Infinite: never. Minus infinite: at once.
         """
         N = unheard.shape[1]
         links, (receiver, sender) = u.reshape(len(u), N, N, PER_LINK), np.indices((N, N))
@@ -299,7 +305,7 @@ class V2X(ScenarioPart):
         return message_time, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
 
     def news(self, own_latency: Floats, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
-        """Times from which each vehicle can react, [n, N] s, and from which i reacts to j, [n, N, N] s.
+        """Time from which each vehicle can react, [n, N] s, and from which vehicle i reacts to vehicle j, [n, N, N] s.
 
         ``own_latency`` [n, N] (s): latencies without the wait for messages. ``u``, ``unheard``: as in
         ``heard_and_seen``.
@@ -314,17 +320,17 @@ class V2X(ScenarioPart):
         return latency, reaction_time
 
     def latest_reaction_s(self, own_latency: Floats, unheard: Bools) -> Floats:
-        """Upper bounds of the times from which vehicles can react, [n, N] s; arguments as in ``news``."""
+        """Latest time from which each vehicle can react, whatever is drawn, [n, N] s. Arguments as in ``news``."""
         n, N = own_latency.shape
         slowest = np.tile([1.0, 0.0, 0.0, 1.0], (n, N * N))  # numbers of links
         return self.news(own_latency, slowest, unheard)[0]
 
 
 def register_preset(name: str, settings: Mapping[str, Any]) -> None:
-    """Register a channel under a name, for ``v2x: name`` in scenarios.
+    """Register a V2X channel as the preset ``name``, for ``v2x: name`` in scenarios.
 
-    ``settings`` is a content of ``v2x``, such as ``{"preset": "nominal", "lost": 0.1}``. Raises ``AlreadyExists`` if
-    another channel has the name, ``InvalidInput`` for a bad name or bad settings.
+    ``settings``: content of the key ``v2x``, such as ``{"preset": "nominal", "lost": 0.1}``. Raises ``AlreadyExists``
+    if another channel has the name, ``InvalidInput`` for a bad name or bad settings.
     """
     if not isinstance(name, str) or re.fullmatch(NAME_PATTERN, name) is None:
         raise InvalidInput(

@@ -1,4 +1,4 @@
-"""Checks of a scenario that involve several keys. Each refuses the first mistake, with its place."""
+"""Checks of a scenario that involve several keys. Each check refuses the first mistake, with its place."""
 
 from __future__ import annotations
 
@@ -67,6 +67,7 @@ def _check_declared_once(scenario: Scenario) -> None:
 
 
 def _check_channel(scenario: Scenario) -> None:
+    """Refuse times, messages and physics that contradict each other."""
     v2x = scenario.v2x
     in_time = scenario.time_step_s <= scenario.horizon_s
     right = f"must not be above horizon_s ({scenario.horizon_s:g} s)"
@@ -84,6 +85,7 @@ def _check_channel(scenario: Scenario) -> None:
 
 
 def _check_roles(scenario: Scenario) -> None:
+    """Refuse roles that ``early_impacts: reject`` forbids, and a Vehicle 1 that learns without an obstacle ahead."""
     for name, role in scenario.roles.items():
         script = role.partition(":")[0]
         hint = "".join(f"; did you mean {close}?" for close in get_close_matches(script, HOLDING_SCRIPTS, n=1))
@@ -131,6 +133,7 @@ class ScenarioWording(Wording):
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:
+        """What would be valid in place of a value that pydantic rejects; "": a general text is used."""
         value, kind = detail["input"], detail["type"]
         if kind == "quantity" or (kind == "float_type" and detail["loc"][-1] == "#number"):
             hints = [suggestion(str(key), DISTRIBUTIONS) for key in value] if isinstance(value, dict) else []

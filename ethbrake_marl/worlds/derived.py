@@ -1,4 +1,4 @@
-"""Quantities that are computed from the declared ones, and checks of all of them."""
+"""Quantities of worlds that follow from those declared in a scenario, and checks of all quantities."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ def world_values(
     declared: Callable[[str], Floats],
     settle: Callable[[str, Floats], Floats] = lambda _, values: values,
 ) -> QuantityValues:
-    """All quantities of k worlds except the distance of the obstacle, from the declared ones.
+    """All quantities of k worlds except the distance of the obstacle: key -> [k, entries].
 
-    ``declared(key)`` returns the drawn values of a declared quantity, [k, entries]; ``settle(key, values)`` may replace
-    values before others are computed from them. ``speed = line speed + own deviation``, ``gap = time gap x speed of the
-    rear vehicle``, ``latency = own latency + time of the alert``. These increase with the declared quantities, so
-    bounds give bounds. Friction limits capacities to friction x gravity.
+    There is an entry for each vehicle or pair, or one for the world. ``declared(key)`` returns the drawn values of a
+    declared quantity, [k, entries]; ``settle(key, values)`` may replace the values of a quantity before others are
+    computed from it: ``speed = line speed + own deviation``, ``gap = time gap x speed of the rear vehicle``, ``latency
+    = own latency + time of the alert``. These increase with the declared quantities, so bounds of the declared
+    quantities give bounds of the results. Friction limits capacities to friction x gravity.
     """
     keys = [key for key in (*USUAL, *OPTIONAL) if key != "obstacle_gap_m" and key in scenario.sources]
     values = {key: declared(key) for key in keys}
@@ -51,9 +52,9 @@ def world_values(
 def obstacle_gap(scenario: Scenario, values: QuantityValues, declared: Callable[[str], Floats]) -> Floats:
     """Distance from Vehicle 1 to the obstacle, [k, 1] m, in a scenario with an obstacle.
 
-    It is declared, or ``margin + v_1 tau_1 + v_1^2 / (2 a_1)`` from speed, latency and braking capacity of Vehicle 1.
-    The margin is the distance left after full braking (which takes longer if brakes build up:
-    ``motion.forces.stopping_m``).
+    The scenario declares this distance, or a margin: the distance that is left after full braking. With a margin it is
+    ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``, from speed, latency and braking capacity of Vehicle 1, or longer if brakes
+    build up (``motion.forces.stopping_m``).
     """
     if "obstacle_gap_m" in scenario.sources:
         return declared("obstacle_gap_m")
@@ -64,10 +65,10 @@ def obstacle_gap(scenario: Scenario, values: QuantityValues, declared: Callable[
 
 
 def mistakes(scenario: Scenario, low: QuantityValues, high: QuantityValues) -> Iterator[tuple[str, int, int, str]]:
-    """Contradictions in k worlds whose quantities lie between ``low`` and ``high``, each [k, entries].
+    """Contradictions in k worlds whose quantities lie between ``low`` and ``high`` (key -> [k, entries] each).
 
-    Yields the quantity's key (``v2x``: the channel), the vehicle's index, the row of the first such world, and what
-    would be right.
+    Yields for each contradiction the quantity's key (``v2x``: the channel), the vehicle's index from 0, the row of the
+    first world that has it, and what would be right.
     """
 
     def first(holds: Any) -> Any:

@@ -18,16 +18,17 @@ if TYPE_CHECKING:
 
 
 def columns_of(drawn_worlds: DrawnWorlds) -> dict[str, NDArray[np.generic]]:
-    """All columns of drawn worlds, [n] each: ``world`` (its number), ``kinds_of`` and ``quantities_of``."""
+    """Table of drawn worlds, column -> [n]: ``world`` (its number) and columns of ``kinds_of``, ``quantities_of``."""
     numbers = drawn_worlds.worlds.clock[:, NUMBER].astype(np.int64)
     return {"world": numbers, **kinds_of(drawn_worlds), **quantities_of(drawn_worlds.worlds, drawn_worlds.friction)}
 
 
 def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str, Floats]:
-    """Quantities of worlds at the alert, name -> [n], as ``worlds_from_table`` reads them.
+    """Quantities of worlds at the alert, column -> [n], as ``worlds_from_table`` reads them.
 
-    Capacities include the road's ``friction`` [n]. Friction is a column if every world has one; obstacle, rates and
-    weights if some world has them. A missing obstacle is NaN; an infinite rate becomes the largest valid number.
+    Capacities include the limit that the road's ``friction`` [n] sets. There is a column of the friction if every world
+    has one; columns of the obstacle, the brakes' rates and the weights of harm if some world has them. A world without
+    obstacle has NaN there; an infinite rate becomes the largest valid number.
     """
     values = {"gaps_m": worlds.gaps_m, "speeds_mps": worlds.speeds_mps}
     values |= {key: worlds.car[:, row, 1:] for key, row in CAR_QUANTITIES.items()}
@@ -50,14 +51,17 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
 
 
 def fixed_columns(scenario: Scenario) -> set[str]:
-    """Columns of ``quantities_of`` that are equal in all worlds, apart from gaps and speeds."""
+    """Columns of ``quantities_of``, except gaps and speeds, that have one value in all worlds of a scenario."""
     keys = [key for key in CAR_QUANTITIES if key in USUAL or key in scenario.sources]
     ends = {QUANTITIES[key].column_of(i): bounds for key in keys for i, bounds in enumerate(scenario.bounds(key))}
     return {name for name, (low, high) in ends.items() if low == high}
 
 
 def kinds_of(drawn_worlds: DrawnWorlds) -> dict[str, Texts]:
-    """Columns of texts: ``scenario`` (in a mixture), ``recording``, ``vehicle_1_type`` and so on."""
+    """Texts that describe the drawn worlds, column -> [n]: ``scenario``, ``recording``, ``vehicle_1_type`` and so on.
+
+    A column without any text is left out; ``scenario`` has texts only in a mixture.
+    """
     columns = {"scenario": drawn_worlds.scenarios, RECORDING: drawn_worlds.recordings}
     types = drawn_worlds.types.T if (drawn_worlds.types != "").any() else ()
     columns = {name: column for name, column in columns.items() if (column != "").any()}
@@ -65,10 +69,10 @@ def kinds_of(drawn_worlds: DrawnWorlds) -> dict[str, Texts]:
 
 
 def clusters_of(columns: Mapping[str, NDArray[Any]]) -> Texts | None:
-    """Name of each world's cluster, [n]; None if all worlds are independent.
+    """Name of the cluster to which each world belongs, [n]; None if all worlds are independent.
 
-    Worlds of one recording (the text before the last ": " of the column) depend on each other. A world without a
-    recording is its own cluster.
+    Worlds of one recording depend on each other. The column ``recording`` names the recording before its last ": ". A
+    world without a recording is a cluster by itself.
     """
     if RECORDING not in columns:
         return None

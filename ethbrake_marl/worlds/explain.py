@@ -38,7 +38,7 @@ def listed_keys() -> list[Key]:
 
 
 def sentences(scenario: Scenario) -> Iterator[str]:
-    """Sentences about the line, the roles, and every key of the file."""
+    """Sentences that describe a scenario: its line, its roles, and every key that has a value."""
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
     has_obstacle = {member.has_obstacle for member in scenario.members or (scenario,)}
     obstacle = (
@@ -103,7 +103,7 @@ def check_file_name(kind: str, name: str) -> None:
 
 
 def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path = Path()) -> str:
-    """Text of a new scenario file for ``folder``, with the values of ``based_on`` as comments."""
+    """Text of a new scenario file in ``folder``, based on ``based_on``, whose values stand in comments."""
     check_file_name("scenario", name)
     base = load_scenario(based_on)
     values, path = base.declared(), scenario_path(based_on)
@@ -119,7 +119,7 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path
 
 
 def whole_text(scenario: str | Path) -> str:
-    """Text of a scenario's file; if it is based on another scenario, with all values."""
+    """Text of a scenario's file; or a text with all its values, if it is based on another scenario."""
     path, loaded = scenario_path(scenario), load_scenario(scenario)
     text = read_plain(path, YAML_SIZE_LIMIT).decode("utf-8")
     if "based_on" not in parse_yaml(text).content:
@@ -128,6 +128,7 @@ def whole_text(scenario: str | Path) -> str:
 
 
 def scenario_json_schema() -> dict[str, Any]:
+    """JSON Schema of scenario files, with the range of every quantity."""
     schema = Scenario.model_json_schema(schema_generator=FileSchema)
     for properties in (schema["properties"], schema["$defs"]["VehicleType"]["properties"]):
         for key in properties.keys() & QUANTITIES.keys():

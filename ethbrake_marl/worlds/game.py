@@ -26,14 +26,14 @@ WORLDS_AT_ONCE = 1024  # training worlds that are drawn together: drawing one al
 
 
 class WorldPool:
-    """The training worlds of a scenario. It draws many at a time and keeps the rest."""
+    """Source of the training worlds of a scenario. It draws many worlds at a time and keeps those not yet used."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario, self.seed, self.first = scenario, -1, 0
         self.worlds: State | None = None
 
     def __call__(self, n: int, seed: int, first: int) -> State:
-        """Copies of the worlds ``first`` to ``first + n - 1`` of the seed."""
+        """Copies of the training worlds ``first`` to ``first + n - 1`` of the seed, at the alert."""
         worlds = self.worlds
         if worlds is None or seed != self.seed or not self.first <= first or first + n > self.first + worlds.n:
             worlds = self.scenario.sample(max(4 * n, WORLDS_AT_ONCE), seed, first=first, purpose="training")
@@ -49,10 +49,10 @@ def game_of(
     reward_vector: Any = None,
     report: Sequence[str] = (),
 ) -> tuple[Scenario, Game]:
-    """The scenario (with the given observation) and its game. ``names.open_game`` does the same from names.
+    """The scenario with this ``observation``, and its game. ``names.open_game`` finds scenario and scripts by name.
 
-    ``scripts``: body -> script, for vehicles whose role is an agent that looks at the state. The other arguments are
-    those of ``EthBrakeParallelEnv``. Warns (``FreeImpacts``) if an impact costs nothing under a learner's objective.
+    ``scripts``: vehicle (1: Vehicle 1) -> script, for vehicles whose role is the name of an agent. Other arguments as
+    in ``EthBrakeParallelEnv``. Warns (``FreeImpacts``) if an impact costs nothing under a learner's objective.
     """
     if observation is not None:
         current_features = {
@@ -96,15 +96,15 @@ def _warn_of_ties(scenario: Scenario, declared: Declared) -> None:
 
 @cache
 def _warn_once(message: str) -> None:
-    """Warn once of each message, although a training opens its game several times."""
+    """Warn, but only once for each message, because a training opens its game several times."""
     warnings.warn(message, FreeImpacts, stacklevel=2)
 
 
 def views_of(scenario: Scenario) -> tuple[View, ...]:
-    """What each vehicle observes, front to rear.
+    """Features that each vehicle observes, front to rear.
 
-    Default: itself and one neighbour on each side, and if there may be an obstacle also the vehicle's role in the line
-    and the obstacle.
+    By default a vehicle observes itself and one neighbour on each side; if there may be an obstacle, it also observes
+    its role in the line and the obstacle.
     """
     usual = View(["own", "front_1", "rear_1", *(["role", "obstacle"] if scenario.has_obstacle else [])])
     observation = scenario.observation

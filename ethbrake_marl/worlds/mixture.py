@@ -26,7 +26,7 @@ _SHARED_KEYS = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # the mixture has them i
 
 
 def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Content of a scenario file with changed values; a key that becomes None is left out.
+    """``content`` of a scenario file with ``changes``; a key that becomes None is left out.
 
     A new way to declare gaps, speeds or an obstacle replaces the old one.
     """
@@ -40,8 +40,8 @@ def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> d
 def with_members(content: dict[str, Any], scenario: type[Scenario]) -> dict[str, Any]:
     """Content of a mixture with a ``Scenario`` object for each member, and with the values that all members share.
 
-    Keys beside ``mixture`` replace the same keys of every member. A malformed list is returned as it is, for the schema
-    to refuse.
+    A key that stands next to ``mixture`` replaces this key in every member. ``scenario``: the class ``Scenario``.
+    Content with a malformed list is returned unchanged, for the schema to refuse.
     """
     entries = content["mixture"]
     if (
@@ -73,6 +73,7 @@ def with_members(content: dict[str, Any], scenario: type[Scenario]) -> dict[str,
 
 
 def _check_alike(members: Sequence[Scenario]) -> None:
+    """Refuse a member that is listed twice, and members that differ in a key that all must share."""
     first, *later_members = members
     extended = any(member.v2x.extensions for member in members)
     for k, later_member in enumerate(later_members, 1):

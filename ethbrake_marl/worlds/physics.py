@@ -1,4 +1,4 @@
-"""Other kinds of physics than exact impacts, chosen by the key ``physics`` of a scenario."""
+"""Kinds of physics other than exact impacts, chosen by the key ``physics`` of a scenario."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from ethbrake_marl.registry import Registry
 
 
 def register_physics(name: str, physics: Physics) -> None:
-    """Register a physics. Entry points: ``ethbrake_marl.physics``."""
+    """Register a kind of physics under a name. Entry points: ``ethbrake_marl.physics``."""
     PHYSICS.add(name, physics, lambda registered: registered is physics)
 
 

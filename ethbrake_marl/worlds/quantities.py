@@ -82,18 +82,18 @@ class Rule(NamedTuple):
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Stream (``counters.uniform_numbers``) and column of the number that draws the value of entry ``index``.
+        """Stream (``counters.uniform_numbers``) and column of the random number that draws a value.
 
-        ``index`` (from 0) is that of a vehicle or pair.
+        The value is that of the vehicle or pair ``index`` (from 0).
         """
         return self.stream, NUMBERS_PER_VEHICLE * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
-        """Name of the column of vehicle or pair ``index`` (from 0), such as ``gap_1_m``."""
+        """Name of the table column for vehicle or pair ``index`` (from 0), such as ``gap_1_m``."""
         return self.column.format(index + 1)
 
     def owner(self, index: int) -> str:
-        """``vehicle_1`` for ``index`` 0, or ``vehicle_1 to vehicle_2`` for a pair, or "" for a world."""
+        """Vehicle or pair ``index`` (from 0) in words: ``vehicle_1``, or ``vehicle_1 to vehicle_2``; "" for a world."""
         front = f"vehicle_{index + 1}"
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
 
@@ -207,7 +207,7 @@ CAR_QUANTITIES = {
 
 
 def stream_width(stream: tuple[int, ...], vehicles: int) -> int:
-    """Random numbers that one world takes from a ``stream``, such as ``MAIN`` (``counters.uniform_numbers``)."""
+    """Number of random numbers that a world takes from a ``stream`` such as ``MAIN`` (``counters.uniform_numbers``)."""
     return NUMBERS_PER_VEHICLE * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
 
 
@@ -218,5 +218,5 @@ def check_length(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
 
 
 def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, QuantityEntry]:
-    """Columns of a table with these quantities, such as ``{"gap_1_m": ("gaps_m", 0)}``."""
+    """Columns of a table with these quantities: name -> (key, index from 0), such as ``{"gap_1_m": ("gaps_m", 0)}``."""
     return {QUANTITIES[key].column_of(i): (key, i) for key in keys for i in range(QUANTITIES[key].count(vehicles))}

@@ -20,7 +20,7 @@ LEAST_MASS = 1e-6  # least probability of [low, high] before truncation; below i
 
 
 def check_order(ends: tuple[float, float]) -> tuple[float, float]:
-    """Refuse, in a pydantic model, [low, high] with low above high."""
+    """Return the ends [low, high] of a range. Refuse low above high, as an error of the pydantic model."""
     require(ends[0] <= ends[1], (), ends, "low must not be above high")
     return ends
 
@@ -34,7 +34,7 @@ PositiveEnds = Annotated[tuple[PositiveNumber, PositiveNumber], Field(strict=Fal
 
 
 def pick(weights: Sequence[float] | Floats, u: Floats) -> Ints:
-    """Index for each ``u``: the first one whose cumulative share of the ``weights`` is above it."""
+    """For each number in ``u``, index of the first weight whose cumulative share of all ``weights`` is above it."""
     cumulative = np.cumsum(np.asarray(weights, np.float64))
     return np.searchsorted(cumulative / cumulative[-1], u, side="right")
 
@@ -50,7 +50,7 @@ class ScenarioPart(FileModel):
 
 
 class Distribution(ScenarioPart):
-    """A distribution. Its first field has the distribution's name and contains its shape."""
+    """Base class of distributions. The first field of a subclass is the distribution's name; its value is the shape."""
 
     @property
     def support(self) -> tuple[float, float]:
@@ -113,7 +113,7 @@ class Normal(Distribution):
 
 
 class LogNormalShape(ScenarioPart):
-    """Median and standard deviation of the logarithm before truncation, and the smallest and largest value."""
+    """Median, and standard deviation of the logarithm, before truncation; smallest and largest possible value."""
 
     median: PositiveNumber
     sigma: PositiveNumber
@@ -205,5 +205,5 @@ def support(quantity: Any) -> tuple[float, float]:
 
 
 def values(quantity: Any, u: Floats) -> Floats:
-    """Values of a number or distribution for uniform numbers ``u`` [n]."""
+    """Values of a number or distribution, [n], for uniform numbers ``u`` [n] in [0, 1)."""
     return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)

@@ -31,7 +31,10 @@ def check_vehicle(name: str, vehicles: int, at: YamlPath, value: Any) -> None:
 
 
 def check_role(role: str) -> str:
-    """Refuse a role that is not ``name[:argument]``, or names a Python file: scenarios must not run code."""
+    """Return the role. Raise ``InvalidInput`` unless it is ``name`` or ``name:argument``, with a valid argument.
+
+    A Python file is no valid name: scenarios must not run code.
+    """
     match = _FORM.fullmatch(role)
     if match is None:
         raise InvalidInput(
@@ -55,13 +58,13 @@ def check_role(role: str) -> str:
 
 
 def deceleration_of(role: str) -> float | None:
-    """Deceleration a (m/s2; negative: drives) of a role ``constant:a``; None for another role."""
+    """Deceleration a (m/s2; negative: drives) of a role ``constant:a``; None for any other role."""
     name, _, argument = role.partition(":")
     return parse_numeral(argument) if name == "constant" else None
 
 
 def first_command(role: str, braking_capacity: Floats) -> Floats:
-    """Command (m/s2) that a role holds, or that applies until its agent decides, for braking capacities [n]."""
+    """Command that a role holds, or that applies until its agent decides, [n] m/s2, for braking capacities [n]."""
     deceleration = deceleration_of(role)
     if deceleration is not None:
         return np.full(braking_capacity.shape, 0.0 - deceleration)

@@ -60,7 +60,7 @@ class DrawnWorlds(NamedTuple):
 
 
 def draw_worlds(scenario: Scenario, n: int, seed: int, first: int, purpose: Purpose) -> DrawnWorlds:
-    """Worlds ``first`` to ``first + n - 1`` of the endless list of the seed.
+    """Worlds ``first`` to ``first + n - 1`` of the seed's endless list.
 
     Raises ``InvalidInput`` for bad arguments, and for a world that is rejected ``MOST_ATTEMPTS`` times.
     """
@@ -75,13 +75,19 @@ def draw_worlds(scenario: Scenario, n: int, seed: int, first: int, purpose: Purp
 
 
 def member_numbers(scenario: Scenario, index: Ints, seed: int, purpose: Purpose = "list") -> Ints:
-    """Number (from 0) of the member from which each of the worlds ``index`` [n], ascending, is drawn, [n]."""
+    """Number (from 0) of the mixture's member from which each world is drawn, [n].
+
+    ``index`` [n]: numbers of the worlds, in ascending order.
+    """
     u = uniform_numbers(seed, purpose, 0, index)(OF_WORLD, MIXTURE)[:, 0]
     return pick([member.weight for member in scenario.mixture or ()], u)
 
 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> DrawnWorlds:
-    """Worlds ``index`` from these random numbers, not drawn again if they have an early impact. Not for mixtures."""
+    """The worlds ``index`` [n] of a scenario without mixture, drawn from the random ``numbers``.
+
+    A world with an early impact is not drawn again.
+    """
     n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.columns.get(RECORDING)
     numbers, kind, load = cache(numbers), np.zeros((n, N), np.int64), np.zeros((n, N))
     if line is not None:
@@ -100,7 +106,10 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> DrawnWorlds:
 
 
 def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, load: Floats) -> Callable[[str], Floats]:
-    """Function key -> values of a declared quantity, [n, entries]. ``kind`` (vehicle type) and ``load`` are [n, N]."""
+    """Function from the key of a declared quantity to its values in all worlds, [n, entries].
+
+    ``kind``: number of each vehicle's type, [n, N]. ``load``: load of each vehicle, from 0 (empty) to 1 (full), [n, N].
+    """
 
     def declared(key: str) -> Floats:
         entries = scenario.sources[key]
@@ -122,10 +131,10 @@ def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, l
 
 
 def state_of(scenario: Scenario, quantities: QuantityValues, numbers: Numbers, unheard: Bools, index: Ints) -> State:
-    """State at the alert of the worlds ``index`` [n], from ``quantities``: all their quantities.
+    """State at the alert of worlds whose ``quantities`` are all known.
 
-    ``numbers`` draws the delays of V2X links (``counters.uniform_numbers``); links in ``unheard``
-    (``Scenario.unheard``) never deliver.
+    ``index`` [n]: numbers of the worlds, or -1. ``numbers``: source of random numbers for the delays of V2X links
+    (``counters.uniform_numbers``). ``unheard`` [n or 1, N, N]: links that never deliver (``Scenario.unheard``).
     """
     n, N = quantities["speeds_mps"].shape
     line, car = np.zeros((n, layout.LINE_ROWS, N + 1)), np.zeros((n, layout.CAR_ROWS, N + 1))
@@ -156,7 +165,7 @@ def state_of(scenario: Scenario, quantities: QuantityValues, numbers: Numbers, u
 
 
 def _draw_accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> DrawnWorlds:
-    """Worlds ``index``; worlds with an early impact are drawn again if the scenario rejects them."""
+    """The worlds ``index`` [n]. If the scenario rejects early impacts, worlds with such an impact are drawn again."""
     drawn_worlds = draw_once(scenario, uniform_numbers(seed, purpose, 0, index), index)
     if scenario.early_impacts == "keep" or not scenario.learners:
         return drawn_worlds
@@ -180,14 +189,14 @@ def _draw_accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> 
 
 
 def has_early_impact(scenario: Scenario, alert: State) -> Bools:
-    """Whether an impact happens before or when the first learner can act, [n]. Nobody can prevent it."""
+    """Whether an impact happens before or just when the first learner can act, [n]. Nobody can prevent it."""
     deciders = np.array(scenario.learners, np.int64)
     state = first_decision(alert, deciders, StepSettings(deciders, scenario.time_step_s, scenario.horizon_s))
     return np.asarray(state.line[:, IMPACTS].any(axis=1))
 
 
 def merge_draws(parts: Sequence[DrawnWorlds], place: Ints) -> DrawnWorlds:
-    """Worlds of all parts together: row i of the joined parts goes to row ``place[i]``."""
+    """Worlds of all ``parts`` in one batch: row i of the concatenated parts becomes row ``place[i]``."""
     order = np.argsort(place)
 
     def of_parts(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:

@@ -58,7 +58,7 @@ NAME_OR_CONTENT = {"anyOf": [{"type": "object", "additionalProperties": True}, {
 
 
 class Member(ScenarioPart):
-    """One scenario of a mixture. In a file ``scenario`` may be a name or path; loading puts the content there."""
+    """One scenario of a mixture. In a file ``scenario`` may be a name or path; loading replaces it by the content."""
 
     scenario: Annotated[Scenario, WithJsonSchema(NAME_OR_CONTENT)] = Field(
         description="name of a scenario, path of its file, or the content of such a file"
@@ -241,14 +241,14 @@ class Scenario(ScenarioPart):
         return self.draw(n, seed, first=first, purpose=purpose).worlds
 
     def draw(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> DrawnWorlds:
-        """Worlds as in ``sample``, with their types, members and recordings, and the number of rejected draws."""
+        """Worlds as in ``sample``, with frictions, vehicle types, members, recordings and number of rejected draws."""
         return draw_worlds(self, n, seed, first, purpose)
 
     # ---- who is in the line
 
     @property
     def members(self) -> tuple[Scenario, ...]:
-        """Scenarios of a mixture, with the keys beside ``mixture``; empty if this is not a mixture."""
+        """Scenarios of a mixture, with the keys that stand next to ``mixture``; empty if this is not a mixture."""
         return tuple(entry.scenario for entry in self.mixture or ())
 
     @cached_property
@@ -258,7 +258,7 @@ class Scenario(ScenarioPart):
 
     @cached_property
     def learners(self) -> tuple[int, ...]:
-        """Bodies that learn (1: Vehicle 1)."""
+        """Numbers of the vehicles that learn (1: Vehicle 1)."""
         return tuple(i + 1 for i, name in enumerate(self.vehicle_names) if self.roles[name] == LEARNER)
 
     @property
@@ -268,9 +268,9 @@ class Scenario(ScenarioPart):
         return declares_obstacle or any(member.has_obstacle for member in self.members)
 
     def unheard(self, types: Ints | None = None) -> Bools:
-        """Whether i cannot get messages of j because of the equipment of their vehicle types, [n, N, N].
+        """Whether vehicle i cannot get messages of vehicle j because of their types' V2X equipment, [n, N (i), N (j)].
 
-        ``types`` [n, N] are the types. None: whether some possible types exclude it, [1, N, N].
+        ``types`` [n, N]: number of each vehicle's type. None: whether some of the possible types prevent it, [1, N, N].
         """
         if self.types_of_line is None:
             return np.zeros((1, self.vehicles, self.vehicles), np.bool_)
@@ -280,20 +280,20 @@ class Scenario(ScenarioPart):
 
     @cached_property
     def types_of_line(self) -> TypesOfLine | None:
-        """Vehicle types at each place of the line; None without types."""
+        """Vehicle types that are possible at each place of the line; None if the scenario has no types."""
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
     @property
     def columns(self) -> dict[str, TableColumn]:
-        """Columns of the table by name, including ``recording``."""
+        """Columns of the scenario's table by name, including ``recording``."""
         return {} if self.table is None else self.table.by_name
 
     @cached_property
     def sources(self) -> dict[str, list[dict[int, Any]]]:
-        """Sources of each declared quantity, for each vehicle, pair or world.
+        """Where the values of each declared quantity come from: key -> entries of vehicles or pairs, or of the world.
 
-        ``sources["mass_t"]`` may be ``[{0: 2.0, 1: 9.5}, ...]``: vehicle type (0 without types) -> number, distribution
-        or column of the table.
+        An entry maps numbers of vehicle types (0 without types) to a number, a distribution or a column of the table:
+        ``sources["mass_t"]`` may be ``[{0: 2.0, 1: 9.5}, ...]``.
         """
         sources = {}
         for key, rule in QUANTITIES.items():
@@ -312,9 +312,9 @@ class Scenario(ScenarioPart):
         return sources
 
     def bounds(self, key: str) -> tuple[tuple[float, float], ...]:
-        """Smallest and largest value of a quantity, for each vehicle, pair or world.
+        """Smallest and largest value of a quantity, for each vehicle or pair, or once for the world.
 
-        Capacities include the road's friction. An undeclared rate is the largest valid one.
+        Capacities include the limit that the road's friction sets. An undeclared brake rate is the largest valid one.
         """
         at_once = np.full((2, self.vehicles), QUANTITIES[key].high)
         member_bounds = [world_values(member, member.ends).get(key, at_once) for member in self.members or (self,)]
@@ -322,7 +322,7 @@ class Scenario(ScenarioPart):
         return tuple(zip(lows.tolist(), highs.tolist(), strict=True))
 
     def ends(self, key: str) -> Floats:
-        """Smallest and largest value of a declared quantity, [2, entries]."""
+        """Smallest and largest value of a declared quantity, [2, entries]: of each vehicle or pair, or of the world."""
         supports = [np.array([support(quantity) for quantity in entry.values()]) for entry in self.sources[key]]
         return np.array([(ends[:, 0].min(), ends[:, 1].max()) for ends in supports]).T
 
@@ -333,12 +333,12 @@ class Scenario(ScenarioPart):
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
     def content(self, without: Sequence[str] = ()) -> dict[str, Any]:
-        """All values as plain data, including defaults, except the keys ``without`` and the members' titles."""
+        """All values as plain data, with defaults, but without the keys ``without`` and the members' titles."""
         without_words: dict[str, Any] = {"mixture": {"__all__": {"scenario": {*DESCRIPTIVE_KEYS}}}}
         return self.model_dump(mode="json", exclude=without_words | dict.fromkeys(without, True))
 
     def replace(self, **changes: Any) -> Scenario:
-        """The scenario with changed values, such as ``replace(mass_t=2.0)``; a mixture changes in each member.
+        """The scenario with changed values, such as ``replace(mass_t=2.0)``; in a mixture every member changes.
 
         A new way to declare gaps, speeds or an obstacle (``time_gaps_s``) replaces the old one (``gaps_m``). A key that
         becomes None returns to its default.
@@ -357,7 +357,10 @@ class Scenario(ScenarioPart):
 
 
 def plain(value: Any) -> Any:
-    """Plain dicts, lists, numbers and texts from a mapping, sequence, array, model, View, path or enumeration."""
+    """The value as plain dictionaries, lists, numbers and texts.
+
+    It may be a mapping, sequence, array, pydantic model, ``View``, path or enumeration.
+    """
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_unset=True, exclude_none=True)
     if isinstance(value, View):

@@ -1,4 +1,4 @@
-"""Tables of measured values: every world takes one row, the same for all columns."""
+"""Tables of measured values: a world takes its values from one row, the same for all columns."""
 
 from __future__ import annotations
 
@@ -66,6 +66,7 @@ class Table(ScenarioPart):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
+        """Refuse keys that contradict each other, and rows whose length is not the number of columns."""
         require(not (self.file and self.rows), ("file",), self.file, "cannot be combined with rows; leave one out")
         read = "must be given as lists here; only load_scenario reads the rows from a file"
         require(self.rows is not None, ("rows",), UNSHOWN, read)
@@ -77,6 +78,10 @@ class Table(ScenarioPart):
         return self
 
     def check_cells(self, known: Mapping[str, QuantityEntry]) -> None:
+        """Refuse unknown columns, numbers outside the range of their quantity, and unprintable texts.
+
+        ``known``: possible columns of numbers, name -> (key, index from 0).
+        """
         hint = f"known: {', '.join((*known, RECORDING))}"
         for c, name in enumerate(self.columns):
             unknown = f"unknown column; {suggestion(name, known) or hint}"
@@ -105,6 +110,7 @@ class CsvFile(NamedTuple):
 
     @classmethod
     def read(cls, path: Path) -> CsvFile:
+        """CSV file at ``path``, without blank lines. Raises ``InvalidInput`` if the file is not CSV or has no rows."""
         rows, line = dict[int, list[str]](), 1
         data = read_plain(path, CSV_SIZE_LIMIT)
         try:
@@ -120,7 +126,10 @@ class CsvFile(NamedTuple):
         return cls(path, [name.strip() for name in rows.pop(first)], rows)
 
     def cells(self, columns: Sequence[str]) -> list[list[float | str]]:
-        """Cells of each row in ``columns``: numbers, and texts in the column ``recording``."""
+        """Cells of each row in ``columns``: numbers, but texts in the column ``recording``.
+
+        Raises ``InvalidInput`` for a row of another length than the header, and for a text that is not a number.
+        """
         cells: list[list[Any]] = []
         for line, row in self.rows.items():
             if len(row) != len(self.header):
@@ -136,7 +145,10 @@ class CsvFile(NamedTuple):
 
 
 def read_rows(path: Path, columns: object) -> list[list[float | str]]:
-    """Unchecked cells in ``columns``, the list from the key ``table`` of a scenario."""
+    """Cells of a CSV file in ``columns``, the list of names in the key ``table`` of a scenario.
+
+    Ranges are not checked. Raises ``InvalidInput`` for a column that is missing or occurs twice.
+    """
     file = CsvFile.read(path)
     hint = f"the columns of this file are {', '.join(file.header)}"
     if not isinstance(columns, list | tuple):

@@ -28,7 +28,8 @@ from ethbrake_marl.worlds.table import CsvFile
 def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> State:
     """One world from ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; a single number is for all vehicles.
 
-    A missing key takes the scenario's value, which must be fixed. Raises ``InvalidInput`` with key and index.
+    A missing key takes the scenario's value, which must be fixed. Raises ``InvalidInput``, with key and index, for a
+    bad value.
     """
     where = "initial_state"
     if not isinstance(initial_state, Mapping):
@@ -49,8 +50,8 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     """Worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
 
     ``columns`` may also be a pandas or polars data frame, a pyarrow table or a structured array of numpy; rows are
-    matched by position. A missing column (``given_columns``) takes the scenario's value, which must be fixed. Raises
-    ``InvalidInput`` with column and row (from 0).
+    matched by position. Columns of ``given_columns`` that are missing take the scenario's value, which must be fixed.
+    Raises ``InvalidInput``, with column and row (from 0), for a bad value.
     """
     scenario, where = load_scenario(scenario), "initial states"
     columns = columns.collect() if callable(getattr(columns, "collect", None)) else columns  # a LazyFrame of polars
@@ -98,7 +99,7 @@ def given_keys(scenario: Scenario) -> tuple[str, ...]:
 
 
 def given_columns(scenario: Scenario) -> dict[str, QuantityEntry]:
-    """Possible columns of a table of worlds, such as ``{"gap_1_m": ("gaps_m", 0)}``."""
+    """Columns that a table of worlds of this scenario may have: name -> (key, index from 0)."""
     return table_columns(given_keys(scenario), scenario.vehicles)
 
 
@@ -124,8 +125,8 @@ def _worlds(
 ) -> State:
     """Checked worlds from ``columns``, (key, index) -> [n], and the scenario's fixed values.
 
-    Messages begin with ``where``. ``row_text`` names a row in them; None: there is one world, whose values are named by
-    their keys.
+    Error messages begin with ``where``. ``row_text(row)`` names a row in them; None: there is one world, so messages
+    name only key and index.
     """
     if scenario.members:
         raise InvalidInput(
@@ -176,13 +177,13 @@ def _worlds(
 
 
 def _short_text(value: Any) -> str:
-    """Value for a message; of an array or a column only its type."""
+    """Text of a value for a message; for an array or a column only its type."""
     kind = getattr(value, "dtype", getattr(value, "type", None))
     return f"{value!r:.60}" if kind is None else f"{type(value).__name__} of {kind}"
 
 
 def _numbers(what: str, value: Any) -> Floats:
-    """Array of numbers; a missing one is NaN. Refuses booleans, masks and texts, which numpy would convert."""
+    """Array of numbers, NaN where one is missing. Refuses booleans, masks and texts, which numpy would convert."""
     try:
         cells = np.asarray(value)
         if cells.dtype.kind == "O":
@@ -198,7 +199,7 @@ def _numbers(what: str, value: Any) -> Floats:
 
 
 def _number(cell: Any) -> float:
-    """One object as a number. pandas marks a missing one by an ``NAType``."""
+    """One object as a number; NaN for a missing number, which may be None or the ``NAType`` of pandas."""
     if cell is None or type(cell).__name__ == "NAType":
         return math.nan
     if isinstance(cell, bool) or not isinstance(cell, Real | Decimal):

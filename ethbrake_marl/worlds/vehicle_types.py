@@ -46,7 +46,7 @@ class WithLoad(ScenarioPart):
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """Quantity, [n], for each ``load`` (0 empty, 1 full); ``u``, uniform in [0, 1), draws the spread."""
+        """Quantity for each ``load`` [n] (0 empty, 1 full), [n]. Uniform numbers ``u`` [n] draw the spread."""
         empty, full = self.with_load
         value_for_load = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
         return value_for_load if self.spread == 0.0 else value_for_load + values(self.spread, u)
@@ -66,7 +66,7 @@ def _type_quantity(key: str) -> Any:
 class VehicleType(ScenarioPart):
     """Masses, capacities, latencies and more of one kind of vehicle.
 
-    What it does not declare, the scenario declares outside ``vehicle_types``.
+    The scenario declares outside ``vehicle_types`` the quantities that a type does not declare.
     """
 
     weight: Weight = Field(default=1.0, description="how likely this type is, relative to the other types")
@@ -119,6 +119,7 @@ Types = Annotated[
 
 
 def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: int) -> None:
+    """Refuse a list of ``types`` with a wrong length, or with a type that ``vehicle_types`` does not declare."""
     right = "can be used only with the key vehicle_types, which declares the types"
     require(kinds is not None, ("types",), types, right)
     check_length(types, vehicles, "vehicle", ("types",))
@@ -131,7 +132,7 @@ def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: i
 
 
 class TypesOfLine:
-    """The possible types at each place of a line. Types are numbered as in ``vehicle_types``."""
+    """Possible vehicle types at each place of a line, numbered from 0 in the order of ``vehicle_types``."""
 
     def __init__(self, kinds: Mapping[str, VehicleType], types: Any, vehicles: int) -> None:
         self.names, self.kinds = tuple(kinds), tuple(kinds.values())
@@ -144,7 +145,7 @@ class TypesOfLine:
         self.possible: Bools = self.weights > 0.0  # [N, types]
 
     def draw(self, u: Floats) -> tuple[Ints, Floats]:
-        """Type and load of every vehicle, [n, N] each, for uniform numbers ``u`` [n, N, PER_TYPE]."""
+        """Type and load (0 to 1) of every vehicle, [n, N] each, for uniform numbers ``u`` [n, N, PER_TYPE]."""
         types, load = np.zeros(u.shape[:2], np.int64), np.zeros(u.shape[:2])
         for i, weights in enumerate(self.weights):
             types[:, i] = pick(weights, u[:, i, 0])
@@ -154,6 +155,7 @@ class TypesOfLine:
         return types, load
 
     def unheard(self, types: Ints | None) -> Bools:
+        """Links that the vehicles' V2X equipment excludes, as in ``Scenario.unheard``."""
         equipment = [kind.v2x or Equipage() for kind in self.kinds]
         silent = np.array([not equipage.sends for equipage in equipment])
         hears = np.array([("all", "front", "none").index(equipage.hears) for equipage in equipment])
