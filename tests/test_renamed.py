@@ -19,7 +19,9 @@ def names_in(text: str) -> set[str]:
 
 @pytest.mark.parametrize(("old", "new"), RENAMED.items())
 def test_table__is_that_of_the_changelog(old: str, new: str) -> None:
-    rows = [line.split("|") for line in CHANGELOG.read_text("utf-8").split("### Breaking")[0].splitlines() if "|" in line]
+    rows = [
+        line.split("|") for line in CHANGELOG.read_text("utf-8").split("### Breaking")[0].splitlines() if "|" in line
+    ]
     assert any(old in names_in(row[1]) and new in names_in(row[2]) for row in rows[2:])
 
 

@@ -54,7 +54,7 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
 
 
 def harms(alert: State, body: int, decelerations: Floats, count: str, until_s: Floats) -> Floats:
-    """Harm if vehicle ``body`` holds each of the decelerations ``decelerations`` [n, C] (m/s2), [2, n, C].
+    """Harm if vehicle ``body`` holds each of ``decelerations`` [n, C] (m/s2), [2, n, C] m2/s2.
 
     The first row is the harm in ``count``, the second in the count that breaks ties.
     """
@@ -115,9 +115,9 @@ def find_cells(rows, at, harm, step, best, cells):
 
 @kernel
 def take_middle(at, harm, best_so_far):
-    """Set ``known[0]`` to the middle one of the decelerations ``at`` [C] whose ``harm`` [2, C] equals ``known[1:]``.
+    """Set the best deceleration to the middle one of the decelerations ``at`` [C] that do the least harm.
 
-    ``best_so_far`` [3] is the best deceleration so far (m/s2), with its harm in both counts.
+    ``harm`` [2, C] is their harm in both counts. ``best_so_far`` [3] is the best deceleration (m/s2) and its harm.
     """
     ties = 0
     for c in range(len(at)):
@@ -131,7 +131,7 @@ def take_middle(at, harm, best_so_far):
 
 @kernel
 def compare_harm(harm, best_so_far):
-    """-1 if ``harm`` [2] is less than ``known[1:]``, 0 if equal, 1 if more (``best_so_far`` as in ``take_middle``)."""
+    """-1 if ``harm`` [2] is less than the harm in ``best_so_far`` (as in ``take_middle``), 0 if equal, 1 if more."""
     for count in range(2):  # the other count decides ties
         if abs(harm[count] - best_so_far[count + 1]) > TIE_MARGIN:
             return -1 if harm[count] < best_so_far[count + 1] else 1

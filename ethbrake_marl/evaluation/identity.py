@@ -30,7 +30,7 @@ def worlds_sha256(worlds: State) -> str:
 
 
 def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
-    """Entries about a scenario, and the seed of its worlds, for ``evaluate(about=...)``."""
+    """Entries about a scenario, and the seed of its worlds, for ``evaluate_teams(about=...)``."""
     content = json.dumps(scenario.content(without=KEYS_WITHOUT_EFFECT), sort_keys=True, separators=(",", ":"))
     scripts = {name: role for name, role in scenario.roles.items() if role != "learner"}
     about = {"seed": seed, "scripts": scripts, "scenario_sha256": hashlib.sha256(content.encode()).hexdigest()}

@@ -137,7 +137,7 @@ def remove_unfinished(folder: Path) -> None:
 def hold_lock(lock: Path, message: str) -> Iterator[None]:
     """Hold a lock file during the block. If the process ends, the lock is released too.
 
-    Raises ``InvalidInput`` if another process holds it (with the message ``message``), or if the file cannot be locked.
+    Raises ``InvalidInput`` if another process holds it (with ``message``), or if the file cannot be locked.
     """
     held = FileLock(lock, blocking=False, mode=0o666)
     try:

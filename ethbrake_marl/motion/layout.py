@@ -4,7 +4,7 @@ Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, f
 In a row of pairs, column p is the pair (body p, body p + 1). The obstacle is always there: without one, it is ``FAR_M``
 ahead, and the physics leaves it out.
 
-Arrays that most functions share: ``line`` [12, N + 1] changes, ``car`` [10, N + 1] stays, ``scratch`` [ROWS, N + 1]
+Arrays that most functions share: ``line`` [12, N + 1] changes, ``car`` [10, N + 1] stays, ``scratch`` [38, N + 1]
 belongs to one call. A batch of n worlds has one more axis in front: ``line`` [n, 12, N + 1], ``car`` [n, 10, N + 1].
 """
 

@@ -147,7 +147,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def newest_checkpoint(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
-    """Return the newest undamaged checkpoint, or None, and the errors of newer ones, which are deleted."""
+    """The newest undamaged checkpoint, or None, and the errors of newer ones, which are deleted."""
     reasons: list[str] = []
     for path in files_in(folder):
         try:

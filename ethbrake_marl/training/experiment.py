@@ -125,7 +125,7 @@ def run_experiment(
 
 
 def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: OnProgress) -> list[str]:
-    """Return the names for which ``use`` works, and report to ``tell`` why others fail; ``what`` is the kind of names.
+    """Names for which ``use`` works. ``tell`` receives the errors of the others; ``what``: kind of the names.
 
     Raises the error if full braking fails.
     """

@@ -44,7 +44,7 @@ def lines(
 
 
 def driven(line: Floats, car: Floats, command: Any, start: Any, until: Any) -> tuple[Floats, Floats, Floats]:
-    """Return the lines after an interval, what ``move_line`` met, and its scratch memory [n, ROWS, N + 1]."""
+    """Return the lines after an interval, what ``move_line`` met, and its scratch memory [n, SCRATCH_ROWS, N + 1]."""
     n, bodies = len(line), line.shape[2]
     wanted, after, met, scratch = np.zeros((n, bodies)), line.copy(), np.zeros(n, np.int64), scratch_for(bodies)
     wanted[:, 1:] = command

@@ -147,11 +147,11 @@ def measure(plan: Ablation, tell: OnProgress) -> list[LevelResult]:
     measured: list[LevelResult] = []
     for pair_number, (level, drawn_worlds, algorithm) in enumerate(pairs):
         tell(Progress(f"driving {level.name}", pair_number, len(pairs)))
-        measured.append(driven(level, drawn_worlds, algorithm, trained.get((level.name, algorithm), ())))
+        measured.append(measure_level(level, drawn_worlds, algorithm, trained.get((level.name, algorithm), ())))
     return measured
 
 
-def driven(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None, jobs: Any) -> LevelResult:
+def measure_level(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None, jobs: Any) -> LevelResult:
     scenario, measures = level.scenario, []
     named = {f"{algorithm} seed {seed}": f"team@{job.folder}" for seed, job in enumerate(jobs)}
     teams = teams_of(named, scenario) if named else {"scripts": Team("scripts", {})}
@@ -193,7 +193,7 @@ class Answer(NamedTuple):
     game: Game
     worlds: State  # at the alert, in which the joint optimum was searched, [m]
     searched: BestHarmTable
-    driven: Mapping[str, Sequence[Floats]]  # count -> harm of each trained team, [m]
+    team_harm: Mapping[str, Sequence[Floats]]  # count -> harm of each trained team, [m]
 
 
 def with_optima(plan: Ablation, measured: Sequence[LevelResult], threads: int, tell: OnProgress) -> list[LevelResult]:
@@ -242,8 +242,8 @@ def least_known(answer: Answer, answers: Iterable[Answer], count: str) -> Floats
                 harm = problem.follow(profiles.take(rows)).harm(count)
                 best[rows] = np.minimum(best[rows], harm)
             same = rows[original.worlds.line[rows, GAP, 0] == answer.worlds.line[rows, GAP, 0]]
-            for team_harm in original.driven[count]:
-                best[same] = np.minimum(best[same], team_harm[same])
+            for harm in original.team_harm[count]:
+                best[same] = np.minimum(best[same], harm[same])
     return best
 
 

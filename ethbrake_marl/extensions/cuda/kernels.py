@@ -46,7 +46,7 @@ class Results(NamedTuple):
     status: Any  # [n] FINE, NO_ACTION or PHYSICS_FAILED
 
 
-class Ruling(NamedTuple):
+class KernelSettings(NamedTuple):
     learners: Any  # [L]
     time_step_s: Any
     harm: Any
@@ -128,7 +128,8 @@ def play_world(t, memory, stored, pool, following, actions, results, settings, v
 
     ``memory`` is the memory of this thread. ``stored`` has the running episodes, ``pool`` the worlds from which they
     begin; ``following`` [n] is the world of the pool in which each next episode begins. ``actions`` [n, L] float32 are
-    clipped to [-1, 1]. If one of them is NaN, nothing moves and ``results.status`` says so. ``settings``: a ``Ruling``.
+    clipped to [-1, 1]. If one of them is NaN, nothing moves and ``results.status`` says so. ``settings``: a
+    ``KernelSettings``.
     ``view``: a ``ViewArrays``.
     """
     load_world(t, stored, memory)

@@ -27,7 +27,7 @@ def starting_policy(name: str, recipe: str) -> Policy:
 
 
 def start_weights(policy: Policy, network: NetworkSpec, features: Sequence[str], recipe: str) -> dict[str, Float32s]:
-    """Weights of ``policy`` for a network ``network`` that observes ``features``.
+    """Weights of ``policy`` for a ``network`` that observes ``features``.
 
     Raises ``InvalidInput`` for other layers, and if ``features`` lack one that the policy observes.
     """

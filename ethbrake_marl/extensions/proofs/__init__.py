@@ -10,7 +10,7 @@ Shared names. Index l is the front vehicle, f the controlled vehicle, r the rear
 braking capacity and u >= 0 a driving capacity (m/s2). Time 0 is the moment at which the controlled vehicle may act;
 times are in s after it.
 
-- ``at``: one world at time 0, [COLUMNS] of ``line``.
+- ``at``: one world at time 0, [LINE_COLUMNS] of ``line``.
 - ``kind``: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST``.
 - ``time``: time of the contact.
 - ``early``, ``late``: earliest and latest time of the first contact.

@@ -57,7 +57,7 @@ def follower(at, time):
 
 
 def rows_of(state: State, body: int, time_step_s: float = 0.0) -> Floats:
-    """One row ``at`` of numbers for each world, [n, COLUMNS]; the controlled vehicle is ``body`` (1: Vehicle 1).
+    """One row ``at`` of numbers for each world, [n, LINE_COLUMNS]; the controlled vehicle is ``body`` (1: Vehicle 1).
 
     ``time_step_s``: time between decisions; 0: commands may change at any time.
     """

@@ -268,7 +268,7 @@ def combined_bound(at, until, front, rear, cells):
 def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
     """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2).
 
-    ``rows`` [n, COLUMNS]: the worlds (``line``); harm after ``until`` [n] (s) does not count. ``has_front`` and
+    ``rows`` [n, LINE_COLUMNS]: the worlds (``line``); harm after ``until`` [n] (s) does not count. ``has_front`` and
     ``has_rear`` [n]: the neighbour exists, and the pair's next impact counts. ``unavoidable`` [n]: contact cannot be
     avoided. ``cells``: memory, overwritten.
     """

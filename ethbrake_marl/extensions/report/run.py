@@ -79,7 +79,7 @@ class RunReport:
 def write_figures(experiment: Experiment) -> list[Markup]:
     compared, learned, trained = experiment.compared, experiment.learned, experiment.trained
     recipe, (_, game) = trained.training.recipe, open_game(compared.scenario)
-    typical_row = telling_row(compared, learned)
+    typical_row = typical_row_of(compared, learned)
     world, number = compared.worlds([typical_row]), int(compared.result.worlds["world"][typical_row])
     plan = recipe.evaluation
     counts = dict.fromkeys([*HARM, compared.harm_count])
@@ -124,7 +124,7 @@ def write_figures(experiment: Experiment) -> list[Markup]:
     return [drawing(figure, title, description) for title, description, figure in figures.values()]
 
 
-def telling_row(compared: Compared, learned: str) -> int:
+def typical_row_of(compared: Compared, learned: str) -> int:
     """Row of a typical world: the median harm saved by ``learned``, where full braking does harm."""
     harm = COLUMN[compared.harm_count]
     before = compared.result[BASELINE][harm]

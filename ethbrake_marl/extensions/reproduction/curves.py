@@ -20,7 +20,7 @@ from ethbrake_marl.extensions.reproduction.strategies import (
     PAPERS,
     PREDICTED,
     SIMULATED,
-    of_the_process,
+    process_outcomes,
     proven_least_harm,
     strategies,
 )
@@ -52,7 +52,7 @@ def process_lines(reading: Reading, episodes: int, settings: ReproductionSetting
 
     In m2/s2. Strategies without a policy have [n]. Empty without such trainings.
     """
-    outcomes = of_the_process(reading, episodes, settings)
+    outcomes = process_outcomes(reading, episodes, settings)
     trained = {name: np.stack([seed[name]["first"] for seed in seeds]) for name, seeds in outcomes.items()}
     return {**harm_of_strategies(reading._replace(step_s=MAP_STEP_S), episodes, {}), **trained} if outcomes else {}
 

@@ -158,7 +158,7 @@ class PaperMap:
         return state
 
     def follow(self, game: Game, state: State, actions: Floats | None) -> tuple[State, Step]:
-        before, settings = decided(game, state, actions), game.settings
+        before, settings = with_commands(game, state, actions), game.settings
         after, over = sample(before, settings.time_step_s), state.ended
         np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])
         np.copyto(after.clock, before.clock, where=over[:, np.newaxis])
@@ -176,7 +176,7 @@ class PaperMap:
         return after, Step(reward, out, settings.time_step_s)
 
 
-def decided(game: Game, state: State, actions: Floats | None) -> State:
+def with_commands(game: Game, state: State, actions: Floats | None) -> State:
     """State with the commands of scripts and learners, as at the beginning of a step of a game."""
     learners = game.settings.learners
     proposals = proposal_array(learners, actions, state.n)

@@ -24,7 +24,7 @@ from ethbrake_marl.extensions.reproduction.strategies import (
     PAPERS,
     PREDICTED,
     SIMULATED,
-    of_the_process,
+    process_outcomes,
     proven_least_harm,
     strategies,
 )
@@ -146,7 +146,7 @@ def process_sheet(settings: ReproductionSettings, reading: Reading, episodes: in
 
     Empty without such trainings.
     """
-    outcomes = of_the_process(reading, episodes, settings)
+    outcomes = process_outcomes(reading, episodes, settings)
     if not outcomes:
         return []
     mapped = strategies(reading._replace(step_s=MAP_STEP_S), episodes, {})
@@ -249,7 +249,7 @@ def reproduce_random_table(settings: ReproductionSettings) -> Made:
         conclusions(outcomes, policies).items(), conclusions(nearest_outcomes, policies).values(), strict=True
     ):
         claims.append(judge("Table III", text, parts, nearest_parts, why=whys.get(text.partition(":")[0], "")))
-    process = of_the_process(STATED, episodes, settings)
+    process = process_outcomes(STATED, episodes, settings)
     if process:
         for text, pair in {
             "contribution 1 (less harm, fewer collisions), by the paper's process in its map": ("{}", E_V2X_BM),

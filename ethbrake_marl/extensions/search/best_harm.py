@@ -48,7 +48,7 @@ def best_harm(
     world's result depends on no other world.
 
     Args:
-        game: rules of the episodes.
+        game: settings of the episodes.
         alert: worlds at the alert.
         counts: counts of harm to search, one after the other (``episode.counts``). A profile found for one count is
             also tried for the others.
@@ -133,7 +133,7 @@ def search_list(
     """Run ``best_harm`` on a long list of worlds, part by part; an interrupted run continues where it stopped.
 
     Args:
-        game: rules of the episodes.
+        game: settings of the episodes.
         alert: worlds at the alert.
         chunks: folder in which finished parts are stored, and read if they are of the same search. None: no files.
         on_progress: called with the number of finished worlds, and of all.
