@@ -177,7 +177,7 @@ def reward_params(reward: Reward) -> RewardParams:
         return RewardParams(**reward)
     except ValidationError as error:
         first = first_mistake(error)
-        where = "" if isinstance(first.given, dict) else f" = {first.given!r}"
+        where = "" if isinstance(first.value, dict) else f" = {first.value!r}"
         raise InvalidInput(f"reward: {first.place.removeprefix('terms.')}{where}: {first.right}") from None
 
 

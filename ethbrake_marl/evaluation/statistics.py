@@ -104,7 +104,7 @@ def wilson(share: float, count: float) -> tuple[float, float]:
     return 0.0 if share == 0.0 else max(centre - half, 0.0), 1.0 if share == 1.0 else min(centre + half, 1.0)
 
 
-def unpaired(value: Estimate, baseline: Estimate) -> Estimate:
+def unpaired_difference(value: Estimate, baseline: Estimate) -> Estimate:
     """Difference of two means over different worlds, with Welch's interval.
 
     Its squared error is ``s1^2 + s2^2``, with ``s^4 / (s1^4 / f1 + s2^4 / f2)`` degrees of freedom. If a standard error

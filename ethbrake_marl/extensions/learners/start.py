@@ -43,11 +43,11 @@ def start_weights(policy: Policy, network: NetworkSpec, features: Sequence[str],
             f"recipe {recipe!r}: the observation lacks the features {', '.join(missing[:5])}, which the policy of the"
             " key start observes; add them to the observation"
         )
-    return widened(policy, features)
+    return widen(policy, features)
 
 
-def widened(policy: Policy, features: Sequence[str]) -> dict[str, Float32s]:
-    """Weights of the actor for observations ``features``, with weight 0 for those that it did not know."""
+def widen(policy: Policy, features: Sequence[str]) -> dict[str, Float32s]:
+    """Weights of the actor for an observation of ``features``, with weight 0 for those that the policy does not observe."""
     tensors = {name: tensor.copy() for name, tensor in policy.tensors.items() if name.startswith("policy.")}
     first = np.zeros((len(tensors["policy.0.weight"]), len(features)), np.float32)
     first[:, [list(features).index(name) for name in policy.observation.names]] = tensors["policy.0.weight"]

@@ -101,7 +101,7 @@ def _train(plan: TrainingPlan, run: Path, seed: int, settings: ReproductionSetti
     return result.status == "finished"
 
 
-def unconverged(folder: Path) -> str:
+def unconverged_policy(folder: Path) -> str:
     """Agent name of the policy that the paper calls "obtained from training before convergence occurred"."""
     ((run,),) = finished_runs(folder, STOPPED).values()
     return f"policy@{run / 'policy-last'}"

@@ -8,7 +8,7 @@ import numpy as np
 
 from ethbrake_marl.evaluation.statistics import decrease, mean, rate
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, PaperRow, printed_sheet
-from ethbrake_marl.extensions.reproduction.learning import unconverged
+from ethbrake_marl.extensions.reproduction.learning import unconverged_policy
 from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,
@@ -52,7 +52,7 @@ WHY = {  # (row, quantity) -> why ours differs; "": each
     ("", DECREASE): "it follows from the two harms",
     ("", ""): REJECTS,
 }
-GIVEN = {  # what a proof assumes
+PROOF_ASSUMPTIONS = {  # what a proof assumes
     "Table III": "with Vehicle 2 acting at 0.5 s",
     "Table II": "with Vehicle 2 acting at 0.5 s and the speeds of Table III",
 }
@@ -97,7 +97,7 @@ def number_claims(
             why = next(WHY[key] for key in keys if key in WHY)
             if outcome == "cannot be":
                 bound = show.show(proven[quantity]).in_words
-                why = f"{GIVEN[where]} it is at least {bound}, whoever drives (proven for exact impacts)"
+                why = f"{PROOF_ASSUMPTIONS[where]} it is at least {bound}, whoever drives (proven for exact impacts)"
             elif why == OWN_TRAINING:
                 outcome = "undecided"
             elif outcome != "differs" or (why == REJECTS and not_ours):
@@ -261,7 +261,7 @@ def reproduce_random_table(settings: ReproductionSettings) -> Made:
 
 
 def reproduce_hybrid_table(settings: ReproductionSettings) -> Made:
-    episodes, spec = min(STOPPED_WORLDS, settings.episodes), unconverged(settings.folder)
+    episodes, spec = min(STOPPED_WORLDS, settings.episodes), unconverged_policy(settings.folder)
     least = proven_least_harm(STATED, episodes)
 
     def rows(reading: Reading) -> ReportedRows:
