@@ -47,7 +47,7 @@ def start_weights(policy: Policy, network: NetworkSpec, features: Sequence[str],
 
 
 def widen(policy: Policy, features: Sequence[str]) -> dict[str, Float32s]:
-    """Weights of the actor for an observation of ``features``, with weight 0 for those that the policy does not observe."""
+    """Weights of the actor for an observation of ``features``; weights of features that it did not have are 0."""
     tensors = {name: tensor.copy() for name, tensor in policy.tensors.items() if name.startswith("policy.")}
     first = np.zeros((len(tensors["policy.0.weight"]), len(features)), np.float32)
     first[:, [list(features).index(name) for name in policy.observation.names]] = tensors["policy.0.weight"]
