@@ -82,7 +82,7 @@ LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
 
 def relink(text: str, docname: str, folder: Path) -> str:
-    """Return a text whose links are relative to ``folder``, with links that work on the page ``docname``."""
+    """Text whose links are relative to ``folder``, with links that work on the page ``docname``."""
 
     def lead(found: re.Match[str]) -> str:
         path, anchor = Path(os.path.normpath(folder / found[1])), found[2] or ""
@@ -97,13 +97,13 @@ def relink(text: str, docname: str, folder: Path) -> str:
 
 
 def navigation(pages: Iterable[str], caption: str = "") -> str:
-    """Return a hidden table of contents."""
+    """Hidden table of contents."""
     options = ":hidden:\n" + (f":caption: {caption}\n" if caption else "")
     return f"\n\n```{{toctree}}\n{options}\n" + "\n".join(dict.fromkeys(pages)) + "\n```\n"
 
 
 def first_page() -> str:
-    """Return README, with the sections of docs/README.md as the site's navigation."""
+    """README, with the sections of docs/README.md as the site's navigation."""
     text = relink((ROOT / "README.md").read_text("utf-8"), "index", ROOT)
     for section in relink((DOCS / "README.md").read_text("utf-8"), "index", DOCS).split("\n## ")[1:]:
         caption, _, listed = section.partition("\n")
@@ -113,7 +113,7 @@ def first_page() -> str:
 
 
 def commands() -> str:
-    """Return the help of every command, as ``typer utils docs`` writes it, with the commands of extensions."""
+    """Help of every command, as ``typer utils docs`` writes it, with the commands of extensions."""
 
     def imported(group: Any) -> Any:
         for name, command in group.commands.items():
@@ -130,7 +130,7 @@ def commands() -> str:
 
 
 def cards() -> str:
-    """Return the card of every shipped policy, its headings one level lower."""
+    """Card of every shipped policy, its headings one level lower."""
     paths = sorted((ROOT / "ethbrake_marl" / "_policies").glob("*/card.md"))
     texts = [relink(path.read_text("utf-8"), "reference/policies", path.parent) for path in paths]
     return "\n\n".join(re.sub(r"(?m)^#(?=#* )", "##", text) for text in texts)

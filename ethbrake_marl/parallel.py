@@ -57,7 +57,7 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
     one_thread = {"backend": backend, "inner_max_num_threads": 1} if backend.supports_inner_max_num_threads else {}
     with parallel_config(**one_thread):
         parallel = Parallel(jobs, batch_size=1, return_as="generator" if streams else "list")
-    work = (delayed(_answer)(os.getpid(), _pickled(call)) for call in calls)
+    work = (delayed(_answer)(os.getpid(), _pickle_call(call)) for call in calls)
     batches = [work] if streams else iter(lambda: list(islice(work, PER_PROCESS * jobs)), [])
     for batch in batches:
         with _blocked_interrupt() if streams else nullcontext():
@@ -91,7 +91,7 @@ def _blocked_interrupt() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _pickled(call: Call) -> bytes:
+def _pickle_call(call: Call) -> bytes:
     from cloudpickle import dumps  # which also takes what a user's file or a notebook defines
 
     try:

@@ -59,12 +59,12 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
     """Entry points of a group such as ``agents``, by name: this package's first. Several packages may use one name."""
     by_name: dict[str, list[EntryPoint]] = {}
     foreign_points = [point for point in entry_points(group=f"ethbrake_marl.{group}") if giver(point) != DISTRIBUTION]
-    for point in (*sorted(own_points(group), key=by_its_name), *sorted(foreign_points, key=by_its_name)):
+    for point in (*sorted(package_points(group), key=by_its_name), *sorted(foreign_points, key=by_its_name)):
         by_name.setdefault(point.name, []).append(point)
     return by_name
 
 
-def own_points(group: str) -> list[EntryPoint]:
+def package_points(group: str) -> list[EntryPoint]:
     """Entry points of a group for this package's own parts, from its tables ``parts.py``."""
     package = __name__.rpartition(".")[0]
     folder = files(package) / "extensions"

@@ -49,7 +49,7 @@ def train(scenario: str, recipe: str, steps: int, seed: int, output: Path, harm_
 
 
 def make_experiment(training: Training, scratch: str, algorithm: str = "mappo") -> Any:
-    """Return a BenchMARL experiment with a recipe's hyperparameters. BenchMARL writes its files to `scratch`.
+    """BenchMARL experiment with a recipe's hyperparameters. BenchMARL writes its files to `scratch`.
 
     `algorithm`: "mappo", or "ippo", whose critic has the observation of the actor.
     """
@@ -87,7 +87,7 @@ def make_experiment(training: Training, scratch: str, algorithm: str = "mappo") 
 
 
 def policy_of(experiment: Any, training: Training) -> Policy:
-    """Return the shared actor as a policy. A hyperbolic tangent limits its mean to [-1, 1]."""
+    """Shared actor as a policy. A hyperbolic tangent limits its mean to [-1, 1]."""
     from torchrl.modules import MultiAgentMLP
 
     recipe = training.recipe
@@ -114,7 +114,7 @@ def policy_of(experiment: Any, training: Training) -> Policy:
 
 
 def tensors_of(actor: Any, hidden: int) -> dict[str, NDArray[np.float32]]:
-    """Return the actor's weights by the names of `NetworkSpec.tensors`. The last layer gives mean and noise."""
+    """Actor's weights by the names of `NetworkSpec.tensors`. The last layer gives mean and noise."""
     tensors: dict[str, NDArray[np.float32]] = {}
     for k in range(hidden + 1):
         for part in ("weight", "bias"):

@@ -35,7 +35,7 @@ EPOCHS, BATCH, LEARNING_RATE = 20, 512, 1e-3
 
 
 def read_dataset(path: Path) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Return observations [k, F], actions [k, 1] and metadata of a Parquet file from `to_parquet`."""
+    """Observations [k, F], actions [k, 1] and metadata of a Parquet file from `to_parquet`."""
     try:
         metadata = json.loads(pyarrow.parquet.read_metadata(path).metadata[b"ethbrake_marl"])
     except (KeyError, TypeError, pyarrow.ArrowInvalid):
@@ -54,7 +54,7 @@ def read_dataset(path: Path) -> tuple[Tensor, Tensor, dict[str, Any]]:
 
 
 def clone(seen: Tensor, actions: Tensor, seed: int) -> nn.Sequential:
-    """Return a network [F] -> [1], trained to give `actions` [k, 1] for the observations `seen` [k, F]."""
+    """Network [F] -> [1], trained to give `actions` [k, 1] for the observations `seen` [k, F]."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     sizes = [seen.shape[1], *HIDDEN]
@@ -78,7 +78,7 @@ def clone(seen: Tensor, actions: Tensor, seed: int) -> nn.Sequential:
 
 
 def as_policy(network: nn.Sequential, metadata: dict[str, Any], seed: int) -> Policy:
-    """Return the network as a policy, with the scenario and the seeds of its dataset."""
+    """Network as a policy, with the scenario and the seeds of its dataset."""
     (learner,) = metadata["learners"]
     scenario, view = eb.Scenario(**metadata["scenario"]), eb.View(metadata["observation"][learner])
     return Policy.make(
@@ -107,7 +107,7 @@ def train(dataset: Path, seed: int, output: Path) -> None:
 
 
 def make_agent(argument: str | None, settings: eb.AgentSettings) -> eb.Agent:
-    """Return the clone in the folder `argument` as an agent.
+    """Clone in the folder `argument` as an agent.
 
     Its name is `train/clone.py:make_agent:FOLDER`, or `train/clone.py:make_agent:FOLDER+step` with a shield.
     """

@@ -53,7 +53,7 @@ class Settings:
 
 
 def perceptron(inputs: int, hidden: int, last_gain: float, last_bias: float = 0.0) -> nn.Sequential:
-    """Return a network with two hidden layers, one output and PPO's usual initial weights."""
+    """Network with two hidden layers, one output and PPO's usual initial weights."""
     layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, 1)]
     for layer, gain, bias in zip(layers, (2**0.5, 2**0.5, last_gain), (0.0, 0.0, last_bias), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
@@ -72,7 +72,7 @@ class Learner(nn.Module):
         self.optimiser = torch.optim.Adam(self.parameters(), settings.learning_rate, eps=1e-5)
 
     def actions(self, seen: Tensor) -> Normal:
-        """Return the distribution of the actions [..., 1] for observations [..., F]."""
+        """Distribution of the actions [..., 1] for observations [..., F]."""
         return Normal(self.mean(seen), self.log_std.exp())
 
 
@@ -103,7 +103,7 @@ class Copies:
 
     @torch.no_grad()
     def collect(self, learners: dict[str, Learner], settings: Settings) -> tuple[dict[str, Rollout], list[float]]:
-        """Return a rollout per learner, and what the reward counts, summed over each episode that ended."""
+        """Rollout per learner, and what the reward counts, summed over each episode that ended."""
         rollouts = {name: Rollout(self.seen[0][name].size, settings) for name in learners}
         harms: list[float] = []
         for t in range(settings.rollout):
@@ -125,7 +125,7 @@ class Copies:
         return rollouts, harms
 
     def observations(self, name: str) -> Tensor:
-        """Return the learner's observations in all copies, [C, F]."""
+        """Learner's observations in all copies, [C, F]."""
         return torch.from_numpy(np.stack([seen[name] for seen in self.seen]))
 
 

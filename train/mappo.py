@@ -53,7 +53,7 @@ class Settings:
 
 
 def perceptron(inputs: int, hidden: int, outputs: int, last_gain: float, last_bias: float = 0.0) -> nn.Sequential:
-    """Return a network with two hidden layers and PPO's usual initial weights."""
+    """Network with two hidden layers and PPO's usual initial weights."""
     layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, outputs)]
     for layer, gain, bias in zip(layers, (2**0.5, 2**0.5, last_gain), (0.0, 0.0, last_bias), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
@@ -97,7 +97,7 @@ class Copies:
 
     @torch.no_grad()
     def collect(self, actors: dict[str, Actor], steps: int) -> tuple[Rollout, list[float]]:
-        """Return a rollout, and what the reward counts, summed over each episode that ended."""
+        """Rollout, and what the reward counts, summed over each episode that ended."""
         seen: dict[str, list[Tensor]] = {name: [] for name in actors}
         states, actions, rewards, ended, harms = [self.states()], [], [], [], []
         for _ in range(steps):

@@ -59,7 +59,7 @@ class Settings:
 
 
 def perceptron(inputs: int, hidden: int, last_gain: float, last_bias: float = 0.0) -> nn.Sequential:
-    """Return a network with two hidden layers, one output and PPO's usual initial weights."""
+    """Network with two hidden layers, one output and PPO's usual initial weights."""
     layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, 1)]
     for layer, gain, bias in zip(layers, (2**0.5, 2**0.5, last_gain), (0.0, 0.0, last_bias), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
@@ -76,7 +76,7 @@ class Actor(nn.Module):
         self.log_std = nn.Parameter(torch.full((1,), settings.log_std))
 
     def log_prob(self, seen: Tensor, actions: Tensor) -> Tensor:
-        """Return the actions' log density up to a constant, [...]. torch's `Normal` would wait for the GPU."""
+        """Actions' log density up to a constant, [...]. torch's `Normal` would wait for the GPU."""
         noise = (actions - self.mean(seen)[..., 0]) / self.log_std.exp()
         return -0.5 * noise.square() - self.log_std
 

@@ -49,7 +49,7 @@ class Recurrent(nn.Module):
         self.cell, self.head, self.remembers = nn.GRUCell(features, HIDDEN), nn.Linear(HIDDEN, 1), remembers
 
     def forward(self, seen: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean of the action [rows] and the new memory [rows, H]."""
+        """Mean of the action [rows] and the new memory [rows, H]."""
         memory = self.cell(seen, memory if self.remembers else torch.zeros_like(memory))
         return self.head(memory)[:, 0], memory
 
@@ -58,7 +58,7 @@ class Recurrent(nn.Module):
 
 
 def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespace) -> Recurrent:
-    """Return the trained network. Every ten updates, print the mean of what the reward counts."""
+    """Trained network. Every ten updates, print the mean of what the reward counts."""
     torch.manual_seed(args.seed)
     _, game = eb.open_game(scenario, observation=observation, reward={"harm_count": args.harm_count})
     learners = game.settings.learners
@@ -95,7 +95,7 @@ def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespac
 
 
 def make_agent(folder: str, settings: eb.AgentSettings) -> eb.Agent:
-    """Return an agent that uses the network in `folder`."""
+    """Agent that uses the network in `folder`."""
     with safe_open(Path(folder) / "network.safetensors", "numpy") as file:
         content = json.loads(file.metadata()["content"])
         tensors = {name: torch.from_numpy(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118  # no mapping

@@ -113,7 +113,7 @@ class SeededAndTruncated(VecEnvWrapper):
 
 
 def make_worlds(scenario: eb.Scenario, reward: dict[str, Any] = REWARD) -> SeededAndTruncated:
-    """Return `COPIES` copies of a scenario's environment for Stable-Baselines3.
+    """`COPIES` copies of a scenario's environment for Stable-Baselines3.
 
     Row k * L + l is learner l of L in copy k.
     """

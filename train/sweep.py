@@ -30,7 +30,7 @@ from ethbrake_marl.training.training import Training
 
 
 def read_jobs(args: argparse.Namespace) -> list[Job]:
-    """Return all training runs, ordered by seed. The name of a run's folder ends in a hash of all its settings."""
+    """All training runs, ordered by seed. The name of a run's folder ends in a hash of all its settings."""
     recipes = [load_recipe(name) for name in args.recipes]
     settings = read_settings(args.set, [key for recipe in recipes for key in type(recipe).model_fields])
     scenarios = [settings.change_scenario(name) for name in args.scenarios]

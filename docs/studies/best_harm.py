@@ -96,12 +96,12 @@ def main(words: list[str]) -> None:
 
 
 def parts_beside(output: Path) -> Path:
-    """Return the folder of the finished chunks of a search."""
+    """Folder of the finished chunks of a search."""
     return output.with_name(f".{output.name}.parts")
 
 
 def search(given: argparse.Namespace, command: str) -> BestHarmTable:
-    """Return the table that the arguments ask for."""
+    """Table that the arguments ask for."""
     if given.output is not None:
         check_target(given.output)
     scenario, game = open_game(given.scenario, given.vehicles and given.vehicles.split(","))
@@ -126,7 +126,7 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
 
 
 def merged(paths: Sequence[Path], command: str) -> BestHarmTable:
-    """Return the best of several tables of the same worlds, world by world, in the counts of the first."""
+    """Best of several tables of the same worlds, world by world, in the counts of the first."""
     first, *others = tables = [BestHarmTable.load(path) for path in paths]
     if any(not np.array_equal(each.identity, first.identity) for each in others):
         raise InvalidInput("--merge: the tables are of different worlds")
@@ -138,7 +138,7 @@ def merged(paths: Sequence[Path], command: str) -> BestHarmTable:
 
 
 def worlds_of(table: BestHarmTable) -> tuple[Scenario, Game, State]:
-    """Return the shipped scenario that a table's header names, its game, and the table's list of worlds."""
+    """Shipped scenario that a table's header names, its game, and the table's list of worlds."""
     scenario, game = open_game(load_scenario(table.header["scenario"]), table.header["vehicles"])
     return scenario, game, scenario.sample(int(table.header["episodes"]), seed=int(table.header["list_seed"]))
 
@@ -179,7 +179,7 @@ def difference(table: BestHarmTable) -> str:
 
 
 def proven(game: Game, alert: State, first: Floats, total: Floats) -> list[Any]:
-    """Return mean proven harm, rates of proven contact and impact, and of worlds between; and what is known there."""
+    """Mean proven harm, rates of proven contact and impact, and of worlds between; and what is known there."""
     try:
         bound, verdict = proven_harm(game, alert, alert), avoidable(game, alert, alert)
     except InvalidInput:
@@ -192,7 +192,7 @@ def proven(game: Game, alert: State, first: Floats, total: Floats) -> list[Any]:
 
 
 def shipped_bounds(tables: Iterable[BestHarmTable]) -> Sheet:
-    """Return best known harm, proven harm and the gap of every table, as a sheet of means.
+    """Best known harm, proven harm and the gap of every table, as a sheet of means.
 
     gap = (best known harm - proven harm) / best known harm. The header of a table names a shipped scenario and a list
     of its worlds. Raises ``InvalidInput`` if the table holds none of these worlds.

@@ -47,7 +47,7 @@ def job_of(test: str, count: str, name: str, seconds: int, folder: Path) -> Job:
 
 
 def curve_of(run: RunFolder, count: str) -> EstimateCurve:
-    """Return harm against the processor time of the training, without evaluations (s)."""
+    """Harm against the processor time of the training, without evaluations (s)."""
     evaluations = read_object(run.status)["evaluations"]
     return {each["cpu_s"]: Estimate(float(each[HARM[count]]), None) for each in evaluations}
 

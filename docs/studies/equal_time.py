@@ -30,7 +30,7 @@ HEAD = ("agent", "knows", "CPU, ms per world", "first-impact harm", "total harm"
 def drive(
     worlds: eb.State, teams: Mapping[str, eb.Team], game: eb.Game, repeats: int
 ) -> dict[str, tuple[float, eb.State]]:
-    """Return the median processor time per world (ms) and the last states of every team. The teams drive in turn."""
+    """Median processor time per world (ms) and the last states of every team. The teams drive in turn."""
     parts = [worlds.take(slice(first, first + AT_ONCE)) for first in range(0, worlds.n, AT_ONCE)]
     for team in teams.values():
         eb.play_to_end(
@@ -51,7 +51,7 @@ def _plain(states: Sequence[eb.State]) -> list[eb.State]:
 
 
 def rows_of(driven: Mapping[str, tuple[float, eb.State]], teams: Mapping[str, eb.Team]) -> list[Sequence[str]]:
-    """Return the rows of the table, fastest team first.
+    """Rows of the table, fastest team first.
 
     The difference in honest cost from the first team is paired by world, with its 95 % interval.
     """

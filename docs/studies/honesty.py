@@ -46,7 +46,7 @@ class Cost(NamedTuple):
 
     @classmethod
     def of(cls, agent: str, price: float, last: eb.State) -> Cost:
-        """Return the means of episodes with these last states."""
+        """Means of episodes with these last states."""
         drove = last.line[:, DROVE].sum(axis=1) > DROVE_MPS
         harms = (float(last.harm(count).mean()) for count in ("first", "total", "honest"))
         push = float(last.line[:, PUSHED].sum(axis=1).mean())
@@ -54,14 +54,14 @@ class Cost(NamedTuple):
 
 
 def with_price(problem: Problem, price: float) -> Problem:
-    """Return the problem that minimises total harm and the costs of a price."""
+    """Problem that minimises total harm and the costs of a price."""
     passed, _, *others = COUNTS["honest"][2:] if price else np.zeros(4)
     COUNTS[f"a price of {price:g}"] = np.array([0.0, 1.0, passed, price, *others])
     return problem.with_count(f"a price of {price:g}")
 
 
 def costs_of(test: str) -> list[Cost]:
-    """Return full braking, and for each price E-V2X-BM and the best known braking."""
+    """Full braking, and for each price E-V2X-BM and the best known braking."""
     scenario, game = eb.open_game(test)
     alert = scenario.sample(WORLDS, SEED)
     asked = problem_of(game, alert, count="total")
@@ -80,7 +80,7 @@ def costs_of(test: str) -> list[Cost]:
 
 @in_our_style
 def draw(found: dict[str, list[Cost]]) -> Figure:
-    """Return the figure: total harm against the push, with a panel for each test."""
+    """Figure: total harm against the push, with a panel for each test."""
     figure, panels = new_panels((8.0, 3.6), columns=len(found))
     for axes, (test, costs) in zip(panels, found.items(), strict=True):
         for k, agent in enumerate(("full_brake", "e_v2x_bm", "best known")):

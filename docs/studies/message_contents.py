@@ -55,13 +55,13 @@ class Effort(NamedTuple):
 
 
 def scenario_of(line: str, contents: str) -> eb.Scenario:
-    """Return the scenario of a line of vehicles whose messages have these ``contents``."""
+    """Scenario of a line of vehicles whose messages have these ``contents``."""
     name, channel = LINES[line]
     return eb.load_scenario(name).replace(v2x={**channel, "tells": list(CONTENTS[contents])})
 
 
 def learn(runs: Path, line: str, contents: str, steps: int, seed: int) -> Path:
-    """Return the folder of a training. Train first if the folder has no policy."""
+    """Folder of a training. Train first if the folder has no policy."""
     scenario = scenario_of(line, contents)
     folder = runs / f"{line.strip('`')}-{contents}-{steps}-{seed}".replace(" ", "-")
     several = len(scenario.learners)
@@ -75,7 +75,7 @@ def learn(runs: Path, line: str, contents: str, steps: int, seed: int) -> Path:
 
 
 def harms(runs: Path, line: str, contents: str, effort: Effort) -> Floats:
-    """Return the total harm of the policy of every seed, [seeds, worlds] in m2/s2."""
+    """Total harm of the policy of every seed, [seeds, worlds] in m2/s2."""
     scenario = scenario_of(line, contents)
     folders = [learn(runs, line, contents, effort.steps, seed) for seed in range(effort.seeds)]
     agents = {folder.name: eb.LearnedAgent(eb.load_policy(folder / "policy-last")) for folder in folders}
@@ -84,7 +84,7 @@ def harms(runs: Path, line: str, contents: str, effort: Effort) -> Floats:
 
 
 def table(runs: Path, effort: Effort) -> list[list[str]]:
-    """Return the rows: harm, and its change from the usual pieces, with 95 % intervals over seeds and worlds."""
+    """Rows: harm, and its change from the usual pieces, with 95 % intervals over seeds and worlds."""
     found = {(line, each): harms(runs, line, each, effort) for line in LINES for each in CONTENTS}
     rows = []
     for each in CONTENTS:

@@ -74,7 +74,7 @@ def train(seconds: float, seed: int) -> tuple[CAPQL, float, int]:
 
 
 def measure(agent: CAPQL, scenario: eb.Scenario) -> dict[str, Any]:
-    """Return the mean harm of every vehicle for each weight and for full braking, and the hypervolumes."""
+    """Mean harm of every vehicle for each weight and for full braking, and the hypervolumes."""
 
     def driver(weight: tuple[float, ...]) -> Any:
         return eb.policy_agent(lambda seen: agent.eval(seen, np.tile(weight, (len(seen), 1))), clip=True)

@@ -37,7 +37,7 @@ CAPTION = (
 
 
 def channels() -> dict[str, dict[str, str]]:
-    """Return the channels by name: each preset, and each preset with messages also with periodic messages."""
+    """Channels by name: each preset, and each preset with messages also with periodic messages."""
     named = {}
     for preset in PRESETS:
         named[preset] = {"preset": preset}
@@ -66,19 +66,19 @@ def drive(scenario: eb.Scenario, n: int, lines: Mapping[str, dict[str, str]]) ->
 
 
 def price(over: eb.Result, agent: str, count: str) -> Estimate:
-    """Return the harm of the agent minus the harm of its exact counterpart, over one channel."""
+    """Harm of the agent minus the harm of its exact counterpart, over one channel."""
     own, limit = (over[spec][COUNTS[count]] for spec in (agent, LIMITS[agent]))
     return difference(own, limit)
 
 
 def above(over: eb.Result, agent: str) -> Estimate | None:
-    """Return the share of worlds with more harm than the first bound of the agent's shield; None without a shield."""
+    """Share of worlds with more harm than the first bound of the agent's shield; None without a shield."""
     own = over[agent]
     return rate(own["first_impact_harm"] > own["first_bound"] + 1e-6) if "first_bound" in own else None
 
 
 def tables(found: Mapping[str, eb.Result]) -> str:
-    """Return Markdown tables: one of the agents without counterpart, and one per compared agent; a row per channel."""
+    """Markdown tables: one of the agents without counterpart, and one per compared agent; a row per channel."""
     head = ["channel", *(f"`{agent}`, {count}" for agent in ALONE for count in COUNTS)]
     lines = [
         [name, *(mean(over[agent][COUNTS[count]]).in_words() for agent in ALONE for count in COUNTS)]

@@ -43,7 +43,7 @@ def speed(before: eb.State, step: eb.Step, after: eb.State) -> Floats:
 
 
 def train(block: str, seed: int) -> PPO:
-    """Return the model of a program, trained as on its page, with this seed."""
+    """Model of a program, trained as on its page, with this seed."""
     name, _, variant = block.partition("-")
     scenario, worlds, reward = BLOCKS[name]
     reward = {**reward, "speed": 5e-4} if variant == "speed" else reward
@@ -63,7 +63,7 @@ def measure(block: str, model: PPO) -> dict[str, float]:
 
 
 def line(block: str, seeds: list[dict[str, float]]) -> str:
-    """Return the row of a program: median and range of each measure over its seeds."""
+    """Row of a program: median and range of each measure over its seeds."""
     cells = [f"`{block}`"]
     for name, scale, digits in MEASURES.values():
         values = sorted(scale * each[name] for each in seeds if name in each)

@@ -19,7 +19,7 @@ CASES = {  # regime -> gap, leader's speed and deceleration, follower's speed an
 
 
 def way(speed, braking, onset, time):
-    """Return the distance covered at ``time``: coasting until ``onset``, then braking to rest."""
+    """Distance covered at ``time``: coasting until ``onset``, then braking to rest."""
     after = np.clip(time - onset, 0.0, speed / braking)
     return speed * np.minimum(time, onset) + speed * after - braking * after**2 / 2
 

@@ -50,7 +50,7 @@ class Convergence:
     errors: np.ndarray  # [step, column]
 
     def order(self, column: int) -> float | None:
-        """Return the slope of log |error| over log step, by least squares; None if the error is 0 or changes sign."""
+        """Slope of log |error| over log step, by least squares; None if the error is 0 or changes sign."""
         steps = np.array(self.steps_s)
         errors = self.errors[steps <= FITTED_UP_TO_S, column]
         if len(errors) < 2 or not ((errors > 0.0).all() or (errors < 0.0).all()):
@@ -59,7 +59,7 @@ class Convergence:
 
 
 def driven(agent: str, worlds: int, changes: Mapping[str, Any]) -> eb.State:
-    """Return the ends of the first worlds of the list under a changed scenario, with an agent as Vehicle 2."""
+    """Ends of the first worlds of the list under a changed scenario, with an agent as Vehicle 2."""
     scenario, game = eb.open_game(eb.load_scenario(SCENARIO).replace(**changes))
     return eb.play_to_end(game, scenario.sample(worlds, SEED), eb.Team.of({"vehicle_2": eb.make_agent(agent)}, agent))
 
@@ -76,7 +76,7 @@ def convergence(agent: str, worlds: int = WORLDS, steps_s: Sequence[float] = STE
 
 
 def table(study: Convergence) -> str:
-    """Return the results with one agent as a Markdown table: a row per step, and one with the orders."""
+    """Results with one agent as a Markdown table: a row per step, and one with the orders."""
     lines = [
         f"`{study.agent}`: exact mean harm {study.first_mean:.3f} (first-impact) and {study.total_mean:.3f} (total).",
         "",

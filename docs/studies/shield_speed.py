@@ -18,7 +18,7 @@ SCENARIO, GAME = eb.open_game("paper-random")
 
 
 def batch_rate(shield: Shield, n: int) -> float:
-    """Return decisions per second of processor time in a batch of ``n`` worlds with random proposals."""
+    """Decisions per second of processor time in a batch of ``n`` worlds with random proposals."""
     game, rng, done = GAME._replace(shield=shield), np.random.default_rng(0), 0
     state = game.reset(SCENARIO.sample(n, 3))
     game.step(state, rng.uniform(-1.0, 1.0, (n, 1)))  # compiles
@@ -30,7 +30,7 @@ def batch_rate(shield: Shield, n: int) -> float:
 
 
 def single_times(shield: Shield, decisions: int, *, asks: bool = False) -> list[float]:
-    """Return the wall-clock seconds of each decision, one world at a time. ``asks``: the shield's agents propose."""
+    """Wall-clock seconds of each decision, one world at a time. ``asks``: the shield's agents propose."""
     game, rng, took = GAME._replace(shield=shield), np.random.default_rng(0), list[float]()
     while len(took) < decisions:
         state = game.reset(SCENARIO.sample(1, 3, first=len(took)))

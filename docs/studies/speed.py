@@ -68,7 +68,7 @@ class Speed:
 
 
 def rates(work: Work, effort: Effort) -> Floats:
-    """Return the units of work per second of processor time, one value per repetition, ascending."""
+    """Units of work per second of processor time, one value per repetition, ascending."""
     work()
     found = []
     for _ in range(effort.repetitions):
@@ -220,7 +220,7 @@ environment.step({"vehicle_2": [-1.0]})
 
 
 def _start_seconds(effort: Effort) -> Floats:
-    """Return the processor seconds of a new Python process that makes one world and steps it, with compiled kernels."""
+    """Processor seconds of a new Python process that makes one world and steps it, with compiled kernels."""
     found = []
     for _ in range(effort.repetitions + 1):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -292,7 +292,7 @@ def main() -> None:
 
 
 def plain(value: float) -> str:
-    """Return a number with three digits, and k for thousands, M for millions or G for billions."""
+    """Number with three digits, and k for thousands, M for millions or G for billions."""
     for size, letter in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if value >= size:
             return f"{value / size:#.3g}".removesuffix(".") + letter

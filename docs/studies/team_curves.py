@@ -72,7 +72,7 @@ Results = dict[str, Any]  # content of a folder of results, from ``gather``
 
 
 def level_of(name: str) -> eb.Scenario:
-    """Return the scenario of a level, with the same observation for all algorithms."""
+    """Scenario of a level, with the same observation for all algorithms."""
     return eb.load_scenario(name).replace(observation=SEEN)
 
 
@@ -81,7 +81,7 @@ def load_team(folder: Path | str, scenario: eb.Scenario) -> eb.Team:
 
 
 def interquartile_mean(values: np.ndarray, resamples: int = 10_000) -> Estimate:
-    """Return the mean without the lowest and the highest quarter, with a bootstrap interval over the seeds."""
+    """Mean without the lowest and the highest quarter, with a bootstrap interval over the seeds."""
     from scipy.stats import bootstrap, trim_mean
 
     def middle(*drawn: np.ndarray, axis: int) -> np.ndarray:
@@ -151,7 +151,7 @@ def run_script(name: str, clock: Clock, seed: int, folder: Path) -> None:
 
 
 def recipe_of(name: str) -> eb.TrainingRecipe:
-    """Return the recipe, which minimises first-impact harm here."""
+    """Recipe, which minimises first-impact harm here."""
     recipe = eb.load_recipe(name)
     return recipe.replace(reward={**recipe.reward.model_dump(mode="json"), "harm_count": "first"})
 
@@ -341,7 +341,7 @@ def text_of(found: Results) -> str:
 
 
 def curves_of(found: Results, level: str, algorithm: str) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the learning curves of all seeds, [seeds, points, 4].
+    """Learning curves of all seeds, [seeds, points, 4].
 
     The last axis: decisions, processor seconds, first-impact harm, total harm.
     """
@@ -354,7 +354,7 @@ def levels_of(found: Results) -> list[str]:
 
 
 def table(found: Results) -> list[list[str]]:
-    """Return the rows of the table: each algorithm at the end of its time, and the references."""
+    """Rows of the table: each algorithm at the end of its time, and the references."""
     rows = []
     for level in levels_of(found):
         harms = found["references"].get(level, {})
@@ -406,7 +406,7 @@ def draw(found: Results) -> Figure:
 
 
 def main() -> int:
-    """Return 1 if a job failed, else 0."""
+    """1 if a job failed, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, help="folder of results; with --draw also a file of numbers")
     parser.add_argument("--seconds", type=float, default=60.0, help="processor seconds of each training")

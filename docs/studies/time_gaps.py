@@ -26,21 +26,21 @@ LEAST = 0.05  # no share is shown if the mean harm of full braking (m2/s2) is be
 
 
 def with_time_gap(base: eb.Scenario, gap_s: float) -> eb.Scenario:
-    """Return ``base`` with a speed of 20 m/s and the time gap ``gap_s`` for all vehicles."""
+    """``base`` with a speed of 20 m/s and the time gap ``gap_s`` for all vehicles."""
     content = {key: value for key, value in base.declared().items() if key not in ("gaps_m", "speeds_mps")}
     deviations = content.get("speed_deviations_mps", {"uniform": [-2, 2]})
     return eb.load_scenario(content | {"time_gaps_s": gap_s, "line_speed_mps": 20, "speed_deviations_mps": deviations})
 
 
 def mean_harm(scenario: eb.Scenario) -> dict[str, list[float]]:
-    """Return the mean harm of each agent on the same worlds in m2/s2, by count of harm."""
+    """Mean harm of each agent on the same worlds in m2/s2, by count of harm."""
     result = eb.evaluate(scenario, AGENTS, episodes=WORLDS, seed=SEED, harm_count="honest")
     return {count: [float(result[name][column].mean()) for name in AGENTS] for count, column in COUNTS.items()}
 
 
 @in_our_style
 def draw(harm: dict[str, np.ndarray]) -> Figure:
-    """Return the figure: the saved share of full braking's honest cost by agent and time gap, a panel per scenario.
+    """Figure: the saved share of full braking's honest cost by agent and time gap, a panel per scenario.
 
     ``harm``: scenario -> mean honest cost [time gaps, agents] in m2/s2.
     """

@@ -110,11 +110,11 @@ def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
 
 def session_of(model: Any) -> Any:
     """ONNX session for the bytes of a file; a session is returned unchanged."""
-    return _opened(model) if isinstance(model, bytes) else model
+    return _open_session(model) if isinstance(model, bytes) else model
 
 
 @lru_cache(16)
-def _opened(content: bytes) -> Any:
+def _open_session(content: bytes) -> Any:
     with naming_extras():
         import onnxruntime
     try:

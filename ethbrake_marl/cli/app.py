@@ -253,7 +253,7 @@ def with_installed(group: Any, name: str) -> Any:
 
 
 @cache
-def _built(*registered: object) -> Any:
+def _build_commands(*registered: object) -> Any:
     """The commands of ``app``, built once (100 ms) as long as the same commands are registered. Do not change them."""
     return get_command(app)
 
@@ -280,7 +280,7 @@ def whole_command() -> Any:
             )
     groups = [info.typer_instance for info in app.registered_groups if info.typer_instance]
     registered = [command for group in (app, *groups) for command in group.registered_commands]
-    program: Any = _copy_command(_built(*registered, *app.registered_groups))
+    program: Any = _copy_command(_build_commands(*registered, *app.registered_groups))
     for name in _OURS:
         with_installed(program.commands[name], name)
     installed = [name for name in points(COMMANDS.group) if "." not in name]

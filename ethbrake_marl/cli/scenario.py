@@ -95,7 +95,7 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
     yield f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; tried in {n} worlds"
     for name, column in _kinds(trial).items():
         counts = ", ".join(f"{kind or 'no type'} {count}" for kind, count in sorted(Counter(column.tolist()).items()))
-        yield from _folded(f"{name}: {counts}", 2)
+        yield from _fold(f"{name}: {counts}", 2)
     varying = {name: extent for name, extent in ranges.items() if extent["least"] != extent["largest"]}
     width = max(map(len, varying), default=0)
     if varying:
@@ -103,7 +103,7 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
     for name, extent in varying.items():
         yield f"{name:{width}}" + "".join(f" {value:>8.4g}" for value in extent.values())
     same = [f"{name} {extent['least']:g}" for name, extent in ranges.items() if name not in varying]
-    yield from _folded(f"the same in all worlds: {'; '.join(same) or 'nothing'}", 20)
+    yield from _fold(f"the same in all worlds: {'; '.join(same) or 'nothing'}", 20)
     rejected = trial.drawn.rejected
     yield (
         f"early impacts: {_share(rejected, rejected + n, 'draws')} rejected, {_share(trial.early, n)} kept"
@@ -117,11 +117,11 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
         yield "  later impacts are not counted unless you raise horizon_s"
     for learner, shares in trial.known.items():
         knowledge = ", ".join(f"{name} in {100.0 * share:.1f} %" for name, share in shares.items())
-        yield from _folded(f"{learner} knows when it can first act: {knowledge} of the worlds", 4)
+        yield from _fold(f"{learner} knows when it can first act: {knowledge} of the worlds", 4)
     for what, harm in trial.harm.items():
         yield f"mean harm, {what}: {harm['first']:.2f} (first impacts), {harm['total']:.2f} (all impacts)"
     for spec, why in trial.refused.items():
-        yield from _folded(f"{spec} cannot drive here: {why}", 3)
+        yield from _fold(f"{spec} cannot drive here: {why}", 3)
     first = [harm["first"] for harm in trial.harm.values()]
     if len(first) > 1 and first[0] - min(first) <= 0.02 * first[0]:
         yield "there is hardly anything to learn: nothing that was tried does less than 98 % of full braking's harm"
@@ -145,7 +145,7 @@ def _kinds(trial: Trial) -> dict[str, Any]:
     return kinds_of(trial.drawn)
 
 
-def _folded(text: str, most: int, width: int = 80) -> list[str]:
+def _fold(text: str, most: int, width: int = 80) -> list[str]:
     return textwrap.wrap(text, width, max_lines=most, placeholder=" ...", break_on_hyphens=False)
 
 
@@ -165,9 +165,7 @@ def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> Non
     with Out(as_json=as_json) as out:
         chosen = load_scenario(scenario)
         texts = list(sentences(chosen))
-        out.result(
-            {"name": chosen.name, "sentences": texts}, *(line for text in texts for line in _folded(text, 6, 100))
-        )
+        out.result({"name": chosen.name, "sentences": texts}, *(line for text in texts for line in _fold(text, 6, 100)))
 
 
 @scenario_group.command("new", epilog=example("scenario new my-scenario --based-on paper-distance"))

@@ -234,7 +234,7 @@ class Game(NamedTuple):
             hidden = hidden | layer.hides(alert, body)
         return hidden
 
-    def own_infos(self, state: State) -> dict[str, Any]:
+    def extra_infos(self, state: State) -> dict[str, Any]:
         """Infos of this game's shield and layers: name -> [n] or [n, N]."""
         values = {} if self.shield is None else self.shield.infos(self, state)
         infos = {f"shield_{name}": value for name, value in values.items()}

@@ -100,7 +100,7 @@ def of_step(game: Game, state: State, step: Step | None, seed: Any) -> dict[str,
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:
     """Infos of the ``bodies`` in all worlds: a list of dictionaries, one for each world and body, world by world."""
     infos = []
-    shared = per_body(of_step(game, state, step, seed) | game.own_infos(state), state.n, bodies)
+    shared = per_body(of_step(game, state, step, seed) | game.extra_infos(state), state.n, bodies)
     for values, common in zip(numbers(state, bodies).reshape(-1, len(NUMBERS)).tolist(), shared, strict=True):
         info = dict(zip(NUMBERS, values, strict=True))
         info["collided"] = values[COLLIDED] == 1.0
@@ -123,6 +123,6 @@ def arrays(game: Game, state: State, step: Step | None, seed: int, body: int) ->
     """Infos of one body in all worlds: name -> [n]."""
     columns = dict(zip(NUMBERS, numbers(state, np.array([body]))[:, 0].T, strict=True))
     columns["collided"] = columns["collided"] == 1.0
-    for name, value in (of_step(game, state, step, seed) | game.own_infos(state)).items():
+    for name, value in (of_step(game, state, step, seed) | game.extra_infos(state)).items():
         columns[name] = value if value.ndim == 1 else value[:, body - 1]
     return columns

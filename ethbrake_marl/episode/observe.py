@@ -61,9 +61,11 @@ class ObservationPlan(NamedTuple):
     offsets: Ints  # of the observed neighbours: -1 is the next vehicle ahead
     role: bool
     obstacle: bool
-    places: Ints  # [F] index of each feature in the kernel's ``value``; -1: of ``groups`` or ``own``; empty: in order
+    places: (
+        Ints  # [F] index of each feature in the kernel's ``value``; -1: of ``groups`` or ``computed``; empty: in order
+    )
     groups: tuple[tuple[Group, list[int], list[int]], ...]  # of other packages: group, columns, features in the group
-    own: tuple[tuple[int, ComputedFeature, int], ...]  # column, feature, offset (0: of the vehicle itself)
+    computed: tuple[tuple[int, ComputedFeature, int], ...]  # column, feature, offset (0: of the vehicle itself)
     scaling: Floats  # [3, F] 1 / scale, low and high
 
 
@@ -102,14 +104,14 @@ class View:
             plan.places, plan.scaling, np.empty(N_OWN + N_NEIGHBOUR * len(plan.offsets) + N_ROLE + N_OBSTACLE),
             observations,
         )  # fmt: skip
-        if not plan.groups and not plan.own:
+        if not plan.groups and not plan.computed:
             return observations
         functions = {group.function for group, *_ in plan.groups}
         values = {function: function(state, observers, time_step_s) for function in functions}
         for group, columns, places in plan.groups:
             parts = values[group.function][..., group.columns][..., places]
             observations[:, :, columns] = scale_values(parts, plan.scaling[:, columns])
-        for column, entry, offset in plan.own:
+        for column, entry, offset in plan.computed:
             for o, body in enumerate(observers.tolist()):
                 observations[:, o, column] = observe_computed(
                     entry, state, body, offset, knows(state, body, body + offset)

@@ -43,7 +43,7 @@ class WithoutEffect(UserWarning):
     """A setting has no effect, such as an objective when the weight of harm is 0."""
 
 
-def own_terms() -> list[str]:
+def registered_terms() -> list[str]:
     return [name for name in TERMS if name not in RewardParams.model_fields]
 
 
@@ -90,11 +90,11 @@ class RewardParams(FileModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _own_terms(cls, value: Any) -> Any:
+    def _collect_terms(cls, value: Any) -> Any:
         """Move weights of registered terms that stand next to the other settings into the mapping ``terms``."""
         if not isinstance(value, dict):
             return value
-        outside_weights = {name: weight for name, weight in value.items() if name in own_terms()}
+        outside_weights = {name: weight for name, weight in value.items() if name in registered_terms()}
         inside_weights = value.get("terms", {})
         if outside_weights and (not isinstance(inside_weights, dict) or outside_weights.keys() & inside_weights.keys()):
             raise ValueError(
@@ -112,8 +112,8 @@ class RewardParams(FileModel):
     @classmethod
     def _known_terms(cls, value: dict[str, float]) -> dict[str, float]:
         for name in value:
-            if name not in own_terms():
-                raise unknown_name("term", name, own_terms(), may_be_own=True)
+            if name not in registered_terms():
+                raise unknown_name("term", name, registered_terms(), may_be_own=True)
         return {name: value[name] for name in sorted(value) if value[name] != 0.0 and TERMS[name]}  # loads the term
 
     @field_validator("objective", mode="before")
@@ -173,7 +173,7 @@ def reward_params(reward: Reward) -> RewardParams:
             f"reward = {reward!r}: must be a name ({', '.join(REWARDS)}), a mapping such as {{'harm': 1.0}}, or"
             " RewardParams"
         )
-    known = [*RewardParams.model_fields, *own_terms()]
+    known = [*RewardParams.model_fields, *registered_terms()]
     for name in reward:
         if name not in known:
             raise unknown_name("setting of a reward", name, known)
@@ -181,7 +181,7 @@ def reward_params(reward: Reward) -> RewardParams:
         return RewardParams(**reward)
     except ValidationError as error:
         first = first_mistake(error)
-        where = "" if isinstance(first.given, dict) else f" = {first.given!r}"
+        where = "" if isinstance(first.value, dict) else f" = {first.value!r}"
         raise InvalidInput(f"reward: {first.place.removeprefix('terms.')}{where}: {first.right}") from None
 
 
@@ -222,8 +222,8 @@ class Rewarding(NamedTuple):
         if isinstance(report, str) or not isinstance(report, Sequence):
             raise InvalidInput(f"report = {report!r}: must be a list of names of terms, such as ['risk', 'jerk']")
         for name in report:
-            if name not in (*BUILT_IN, *own_terms()):
-                raise unknown_name("term", name, (*BUILT_IN, *own_terms()), may_be_own=True)
+            if name not in (*BUILT_IN, *registered_terms()):
+                raise unknown_name("term", name, (*BUILT_IN, *registered_terms()), may_be_own=True)
         if not line_only and params.harm == 0.0 and "harm" not in report:
             what = declared if isinstance(declared, str) else ", ".join(declared)
             warnings.warn(

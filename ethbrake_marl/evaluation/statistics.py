@@ -104,7 +104,7 @@ def wilson(share: float, count: float) -> tuple[float, float]:
     return 0.0 if share == 0.0 else max(centre - half, 0.0), 1.0 if share == 1.0 else min(centre + half, 1.0)
 
 
-def unpaired(value: Estimate, baseline: Estimate) -> Estimate:
+def unpaired_difference(value: Estimate, baseline: Estimate) -> Estimate:
     """Difference of two means over different worlds, with Welch's interval.
 
     With standard errors s1, s2 and degrees of freedom f1, f2 of the means, the error s of the difference is ``sqrt(s1^2

@@ -160,7 +160,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         if self.step_infos:
             infos = self._infos(stream, state, step)
         elif self.game.shield is not None:
-            infos = per_body(self.game.own_infos(state), self.n, self.bodies)
+            infos = per_body(self.game.extra_infos(state), self.n, self.bodies)
         else:
             infos = [{} for _ in range(self.num_envs)]
         if len(ended):

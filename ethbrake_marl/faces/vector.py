@@ -80,7 +80,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         ``{"listed_world": {"seed": 7, "number": 3}}`` row k has world 3 + k of the list.
         """
         stream, state = self.stream.reset(self.num_envs, seed, options)
-        answer = self._observe(state), masked(self._columns(stream, state, None), np.ones(self.num_envs, np.bool_))
+        answer = self._observe(state), with_masks(self._columns(stream, state, None), np.ones(self.num_envs, np.bool_))
         self._keep(stream, state, self.renderer.began)
         super().reset(seed=None if seed is None else int(np.ravel(stream.seed)[0]))
         return answer
@@ -92,13 +92,13 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         numbers[renewed] = 0.0  # the action of a row that begins again is ignored
         state, step = self._advance(numbers)
         stream, observations, columns = self.stream, self._observe(state), self._columns(self.stream, state, step)
-        infos = masked(columns, np.ones(self.num_envs, np.bool_))
+        infos = with_masks(columns, np.ones(self.num_envs, np.bool_))
         if same and state.ended.any():
             renewed, final = state.ended, np.full(self.num_envs, None, dtype=object)
             for row, last in zip(np.flatnonzero(renewed), observations[renewed], strict=True):
                 final[row] = last
             infos |= {"final_obs": final, "_final_obs": renewed}
-            infos |= {"final_info": masked(columns, renewed), "_final_info": renewed.copy()}
+            infos |= {"final_info": with_masks(columns, renewed), "_final_info": renewed.copy()}
         if renewed.any():
             stream, new = stream.next_episodes(np.flatnonzero(renewed))
             observations[renewed] = self._observe(new)
@@ -116,7 +116,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         return arrays(self.game, state, step, stream.seeds_of(state, rows), self.bodies[0])
 
 
-def masked(columns: dict[str, Any], rows: Bools) -> dict[str, Any]:
+def with_masks(columns: dict[str, Any], rows: Bools) -> dict[str, Any]:
     """Infos in Gymnasium's vector form: arrays of values, each with the mask ``rows`` [n] of its valid rows."""
     infos: dict[str, Any] = {}
     for name, column in columns.items():

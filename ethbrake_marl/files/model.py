@@ -142,7 +142,7 @@ class Mistake(NamedTuple):
     """A mistake in data from a program. Its text says where the mistake is and what would be valid."""
 
     place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
-    given: Any  # the invalid value
+    value: Any  # the invalid value
     right: str  # what would be valid
 
     def __str__(self) -> str:

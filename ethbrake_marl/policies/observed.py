@@ -55,7 +55,7 @@ class FeatureDefinition(FiniteModel):
     tried: Annotated[tuple[float, ...], Field(max_length=64)]  # what is observed in a few worlds
 
     @classmethod
-    def of_own(cls, name: str, entry: ComputedFeature) -> Self:
+    def of_entry(cls, name: str, entry: ComputedFeature) -> Self:
         feature = entry.feature
         return cls(
             name=name, of=entry.of, unit=feature.unit, scale=feature.scale, low=feature.low, high=feature.high,
@@ -81,7 +81,7 @@ class ObservationSchema(FiniteModel):
         return cls(
             front=max(0, -min(sides)), rear=max(0, *sides), features=view.names,
             scaling_sha256=hashlib.sha256(json.dumps(scaling).encode()).hexdigest(),
-            registered=tuple(FeatureDefinition.of_own(name, FEATURES[name]) for name in names),
+            registered=tuple(FeatureDefinition.of_entry(name, FEATURES[name]) for name in names),
         )  # fmt: skip
 
     def check(self, where: Path, version: str) -> None:
@@ -98,9 +98,9 @@ class ObservationSchema(FiniteModel):
                     " yourself first with eb.register_feature"
                 )
             entry = FEATURES[old.name]
-            new = FeatureDefinition.of_own(old.name, entry)
+            new = FeatureDefinition.of_entry(old.name, entry)
             alike = len(old.tried) == len(new.tried) and np.allclose(old.tried, new.tried, rtol=1e-6, atol=1e-6)
-            if alike or _is_ours(entry):
+            if alike or _is_built_in(entry):
                 new = new.model_copy(update={"tried": old.tried})
             for key, value in new:
                 if getattr(old, key) != value:
@@ -120,14 +120,14 @@ class ObservationSchema(FiniteModel):
             )
 
 
-def _is_ours(entry: ComputedFeature) -> bool:
+def _is_built_in(entry: ComputedFeature) -> bool:
     return str(getattr(entry.function, "__module__", "")).startswith("ethbrake_marl.")
 
 
 def _trial_values(entry: ComputedFeature) -> tuple[float, ...]:
     """Values of a feature in some trial worlds: in one world if this package defines the feature, else in three."""
     state = _trial_worlds()
-    if _is_ours(entry):
+    if _is_built_in(entry):
         state = state.take(slice(1))
     all_known = np.ones(state.n, np.bool_)
     places = [(1, 0), (2, 0), (3, 0)] if entry.of == "own" else [(2, -1), (2, 1), (3, -2)]

@@ -70,14 +70,16 @@ class Policy:
 
         Raises ``InvalidInput`` that names the invalid tensor or field.
         """
-        data = serialised(tensors)
+        data = serialise(tensors)
         try:
             draft = Manifest(
                 **{"versions": installed_versions(), **manifest}, network=network,
                 format_version=network.format_version, observation=ObservationSchema.of(observation),
                 weights_sha256=hashlib.sha256(data).hexdigest(), manifest_sha256="0" * 64,
             )  # fmt: skip
-            return cls(draft.model_copy(update={"manifest_sha256": _own_sha256(draft)}), checked_tensors(data, network))
+            return cls(
+                draft.model_copy(update={"manifest_sha256": _manifest_sha256(draft)}), checked_tensors(data, network)
+            )
         except ValueError as error:
             reason = first_mistake(error) if isinstance(error, ValidationError) else error
             raise InvalidInput(f"policy: {reason}") from None
@@ -88,17 +90,17 @@ class Policy:
         Raises ``AlreadyExists`` for an existing folder; with ``replace`` that folder is deleted once the new one is
         complete.
         """
-        manifest = self.manifest.model_copy(update={"manifest_sha256": _own_sha256(self.manifest)})
+        manifest = self.manifest.model_copy(update={"manifest_sha256": _manifest_sha256(self.manifest)})
         with new_folder(Path(folder).expanduser(), replace=replace) as partial:
-            write_file(partial / WEIGHTS, serialised(self.tensors))
+            write_file(partial / WEIGHTS, serialise(self.tensors))
             write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
 
 
-def _own_sha256(manifest: Manifest) -> str:
+def _manifest_sha256(manifest: Manifest) -> str:
     return content_sha256(manifest.model_dump(mode="json"))  # keys of earlier versions are not written
 
 
-def serialised(tensors: Mapping[str, Float32s]) -> bytes:
+def serialise(tensors: Mapping[str, Float32s]) -> bytes:
     return safetensors.numpy.save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
 
 

@@ -47,7 +47,7 @@ class Ppo(Algorithm):
         if training.scheme == "independent":
             return IndependentPPO(environment, training, policy_kwargs=network, **settings)
         if training.scheme == "centralised":
-            network["own"] = len(training.row.names)
+            network["actor_size"] = len(training.row.names)
             return PPO(CentralCriticPolicy, environment, policy_kwargs=network, **settings)
         return PPO("MlpPolicy", environment, policy_kwargs=network, **settings)
 

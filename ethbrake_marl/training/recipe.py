@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 from pydantic import Field, field_validator, model_validator
 
 from ethbrake_marl.episode.features import listed_features
-from ethbrake_marl.episode.reward import RewardParams, own_terms
+from ethbrake_marl.episode.reward import RewardParams, registered_terms
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.model import NAME_PATTERN, FileModel, NonNegative, Positive, Wording, read_model, refuse
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
@@ -310,7 +310,7 @@ class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
         """Valid keys in place of the last key of ``path``, including registered terms inside ``reward``."""
         inside = super().known(path)
-        return [*inside, *own_terms()] if path[:-1] == ("reward",) else inside
+        return [*inside, *registered_terms()] if path[:-1] == ("reward",) else inside
 
 
 def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any] | str) -> None:

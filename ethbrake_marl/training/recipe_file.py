@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic.json_schema import models_json_schema
 
-from ethbrake_marl.episode.reward import own_terms
+from ethbrake_marl.episode.reward import registered_terms
 from ethbrake_marl.files.json_schema import FileSchema
 from ethbrake_marl.training.recipe import ALGORITHMS, TrainingRecipe
 
@@ -22,7 +22,7 @@ def recipe_schema() -> dict[str, Any]:
         keys = parts[str(places[recipe, "validation"]["$ref"]).rpartition("/")[2]]["properties"]
         keys["algorithm"] |= {"description": key_meanings(recipe)["algorithm"], "const": name}
     weight = {"type": "number", "description": "weight of a registered term"}
-    parts["RewardParams"]["properties"] |= {name: weight for name in own_terms()}
+    parts["RewardParams"]["properties"] |= {name: weight for name in registered_terms()}
     ways = [
         {
             "if": {"properties": {"algorithm": {"const": name}}, "required": ["algorithm"]},

@@ -23,26 +23,28 @@ from ethbrake_marl.training.training import Training
 
 
 class CentralCriticPolicy(ActorCriticPolicy):
-    """PPO policy whose actor sees the first ``own`` entries of an observation, and whose critic sees all."""
+    """PPO policy whose actor sees the first ``actor_size`` entries of an observation, and whose critic sees all."""
 
-    def __init__(self, *arguments: Any, own: int, **settings: Any) -> None:
-        self.own = own  # set before ``super().__init__``, which builds the networks
+    def __init__(self, *arguments: Any, actor_size: int, **settings: Any) -> None:
+        self.actor_size = actor_size  # set before ``super().__init__``, which builds the networks
         super().__init__(*arguments, **settings)
 
     def _build_mlp_extractor(self) -> None:
-        self.mlp_extractor = _OwnPartForTheActor(self.own, self.features_dim, self.net_arch, self.activation_fn)
+        self.mlp_extractor = _CentralCriticExtractor(
+            self.actor_size, self.features_dim, self.net_arch, self.activation_fn
+        )
 
 
-class _OwnPartForTheActor(MlpExtractor):
+class _CentralCriticExtractor(MlpExtractor):
     """Hidden layers of an actor, for the first ``actor_size`` entries of an observation, and of a critic, for all."""
 
     def __init__(self, actor_size: int, critic_size: int, net_arch: Any, activation_fn: Any) -> None:
         super().__init__(actor_size, net_arch, activation_fn, device="cpu")
         self.value_net = MlpExtractor(critic_size, net_arch, activation_fn, device="cpu").value_net
-        self.own = actor_size
+        self.actor_size = actor_size
 
     def forward_actor(self, features: Tensor) -> Tensor:
-        return super().forward_actor(features[:, : self.own])
+        return super().forward_actor(features[:, : self.actor_size])
 
 
 class SeparatePolicies(BasePolicy):

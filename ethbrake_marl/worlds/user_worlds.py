@@ -36,7 +36,7 @@ def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> S
         raise InvalidInput(f"{where} = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
     columns = dict[QuantityEntry, Floats]()
     for key, value in initial_state.items():
-        _check_known(f"{where}: unknown key {key!r}", str(key), given_keys(scenario))
+        _check_known(f"{where}: unknown key {key!r}", str(key), world_keys(scenario))
         count, numbers = QUANTITIES[key].count(scenario.vehicles), _numbers(f"{where}: {key}", value)
         if numbers.shape not in ((), (count,)):
             several = f"must be a list of {count} numbers (for {scenario.vehicles} vehicles), or one number for all"
@@ -50,7 +50,7 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     """Worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
 
     ``columns`` may also be a pandas or polars data frame, a pyarrow table or a structured array of numpy; rows are
-    matched by position. Columns of ``given_columns`` that are missing take the scenario's value, which must be fixed.
+    matched by position. Columns of ``world_columns`` that are missing take the scenario's value, which must be fixed.
     Raises ``InvalidInput``, with column and row (from 0), for a bad value.
     """
     scenario, where = load_scenario(scenario), "initial states"
@@ -92,15 +92,15 @@ def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
     return _worlds(scenario, columns, str(file.path), lambda row: f", line {[*file.rows][row]}")
 
 
-def given_keys(scenario: Scenario) -> tuple[str, ...]:
+def world_keys(scenario: Scenario) -> tuple[str, ...]:
     """Keys of the quantities that worlds of this scenario have, such as ``gaps_m``."""
     special_cases = {"obstacle_gap_m": scenario.has_obstacle}
     return USUAL + tuple(key for key in OPTIONAL if special_cases.get(key, key in scenario.sources))
 
 
-def given_columns(scenario: Scenario) -> dict[str, QuantityEntry]:
+def world_columns(scenario: Scenario) -> dict[str, QuantityEntry]:
     """Columns that a table of worlds of this scenario may have: name -> (key, index from 0)."""
-    return table_columns(given_keys(scenario), scenario.vehicles)
+    return table_columns(world_keys(scenario), scenario.vehicles)
 
 
 def _check_known(what: str, name: str, known: Sequence[str]) -> None:
@@ -109,7 +109,7 @@ def _check_known(what: str, name: str, known: Sequence[str]) -> None:
 
 
 def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[QuantityEntry]:
-    possible_columns = given_columns(scenario)
+    possible_columns = world_columns(scenario)
     for name in header:
         if header.count(name) > 1:
             raise InvalidInput(f"{where}: column {name!r} occurs twice")

@@ -16,7 +16,7 @@ from typing import NoReturn
 import pytest
 import typer
 
-from ethbrake_marl.cli.app import COMMANDS, _built, add_command, run_command
+from ethbrake_marl.cli.app import COMMANDS, _build_commands, add_command, run_command
 from tests.fixtures.commands import Command
 
 COAST = "evaluate --agents coast --episodes 3"
@@ -36,8 +36,8 @@ RUN = [sys.executable, "-W", "error", "-m", "ethbrake_marl"]
 )
 def test_exit_of_typer__is_a_success(line: str, ethbrake: Command, tmp_path: Path, monkeypatch, request) -> None:
     monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")  # the option then takes a shell
-    _built.cache_clear()
-    request.addfinalizer(_built.cache_clear)
+    _build_commands.cache_clear()
+    request.addfinalizer(_build_commands.cache_clear)
     monkeypatch.setenv("HOME", str(tmp_path))
     answer = ethbrake(*line.split())
     assert (answer.status, answer.err) == (0, "") and answer.out

@@ -89,7 +89,7 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    """Return the blocks of a page. Raises ``AssertionError`` for an unknown mark, or a mark without a block."""
+    """Blocks of a page. Raises ``AssertionError`` for an unknown mark, or a mark without a block."""
     found: list[Block] = []
     marks: dict[str, str] = {}
     for token in MarkdownIt().parse(page.read_text("utf-8")):
@@ -207,7 +207,7 @@ def check_output(place: str, shown: str, printed: str, left_out: str = "") -> No
 
 
 def columns_of(file: Path, shown: str) -> str:
-    """Return the text of a file; of a CSV file only the columns that the page shows."""
+    """Text of a file; of a CSV file only the columns that the page shows."""
     if file.suffix != ".csv":
         return file.read_text()
     header = shown.partition("\n")[0].split(",")
@@ -249,7 +249,7 @@ def short_form(words: list[str]) -> list[str]:
 
 
 def is_run(words: list[str], whole: bool) -> bool:
-    """Return whether a command is run. Installations and targets of make are not, except ``make run``."""
+    """Whether a command is run. Installations and targets of make are not, except ``make run``."""
     program, *rest = words
     if program == "make":
         return whole and rest == ["run"]

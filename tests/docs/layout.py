@@ -34,7 +34,7 @@ this. `python -m tests.docs.layout` makes this page from the code.
 | Why did the shield replace an action? | `shields/step.py`: the proof, then the code; codes in `shields/shield.py` |
 | What is a reward term? | `episode/terms.py` (formulas), `episode/reward.py` (weights, named rewards) |
 | Which agents are there? | `parts.py`, `agents/`; what names mean: `names.py`; [add one](../extend.md#an-agent) |
-| Who lets agents drive? | `agents/team.py`: `play`, `drive` |
+| Who lets agents drive? | `agents/team.py`: `play`, `play_to_end` |
 | What can a scenario file say? | `worlds/`: `scenario.py`, `quantities.py`; [scenarios](../scenarios.md) |
 | How does a training run? | `training/`: `train.py`, `ppo.py`, `sac.py`; between two updates: `updates.py` |
 | How do I add a column to an evaluation? | [a measure](../extend.md#a-measure) |
@@ -46,12 +46,12 @@ cli/evaluate.py         evaluate_command
 names.py                teams_of, make_agent; parts.py says: agents/trained.py, make_trained
 policies/bundle.py      load_shipped
 evaluation/compared.py  Compared.of (in Python one begins with the next line)
-evaluation/door.py      evaluate; worlds/sampling.py, draw: the fixed list of worlds
-evaluation/evaluate.py  evaluate, _driven
-agents/team.py         play, and in each step:
-episode/game.py           Game.step
-episode/step.py           step; script_calls.py, ask_script: agents/policy_agent.py, policies/actor.py
-motion/interval.py        move_line; motion/impact.py, resolve_impacts: the harm
+evaluation/door.py      evaluate; worlds/sampling.py, draw_worlds: the fixed list of worlds
+evaluation/evaluate.py  evaluate_teams
+agents/team.py          play, and in each step:
+episode/game.py         Game.step
+episode/step.py         step; script_calls.py, ask_script: agents/policy_agent.py, policies/actor.py
+motion/interval.py      move_line; motion/impact.py, resolve_impacts: the harm
 evaluation/measures.py  harm: episode/state.py, State.harm
 evaluation/summary.py   summarise; statistics.py, mean
 files/sheet.py          Sheet: columns become text

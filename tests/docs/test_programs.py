@@ -14,7 +14,7 @@ FOLDERS = ("docs", "docs/studies", "tests", "train")
 
 
 def is_program(file: Path) -> bool:
-    """Return whether a file does something when it is run: it has a guard, or is a study."""
+    """Whether a file does something when it is run: it has a guard, or is a study."""
     text, guard = file.read_text("utf-8"), '__name__ == "__main__"'
     statements = ast.parse(text).body if guard in text.replace("'", '"') else []
     guarded = any(

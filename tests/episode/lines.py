@@ -14,7 +14,7 @@ from tests.motion.lines import driven, lines
 
 
 def state_of(gaps_m: Any, speeds_mps: Any, **settings: Any) -> State:
-    """Return worlds at the alert; a vehicle knows all others after its own latency; settings as for ``lines``."""
+    """Worlds at the alert; a vehicle knows all others after its own latency; settings as for ``lines``."""
     line, car = lines(gaps_m, speeds_mps, **settings)
     car[:, at.OWN_LATENCY] = car[:, at.LATENCY]
     know = np.repeat(car[:, at.LATENCY, :, np.newaxis], line.shape[2], axis=2)

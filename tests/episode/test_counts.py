@@ -89,7 +89,7 @@ def opened(name: str, count: str) -> tuple[Game, State]:
 
 
 def random_plans(game: Game, state: State, seed: int) -> np.ndarray:
-    """Return plans [n, T, L] that often drive, and brake at the end, so that every row of a count is met."""
+    """Plans [n, T, L] that often drive, and brake at the end, so that every row of a count is met."""
     rng, steps = np.random.default_rng(seed), 30
     shape = state.n, steps, len(game.settings.learners)
     plans = np.where(rng.random(shape) < 0.3, 1.0, rng.uniform(-1.0, 1.0, shape))

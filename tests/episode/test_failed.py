@@ -19,7 +19,7 @@ N, PLANTED = 5, 3
 
 
 def planted(state: State) -> State:
-    """Return the worlds, in one of which vehicles 2 and 3 overlap by 1 m when vehicle 2 meets vehicle 1."""
+    """Worlds, in one of which vehicles 2 and 3 overlap by 1 m when vehicle 2 meets vehicle 1."""
     line = state.line.copy()
     line[PLANTED, GAP, 1:3], line[PLANTED, SPEED, 1:] = (0.5, -1.0), (10.0, 20.0, 16.0)
     return state._replace(line=line)

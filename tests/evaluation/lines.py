@@ -86,7 +86,7 @@ def evaluated(
 
 
 def recorded(recordings: int, rows_of_each: int = 20) -> Scenario:
-    """Return a scenario of rows of several recordings, each with gaps and speeds of its own."""
+    """Scenario of rows of several recordings, each with gaps and speeds of its own."""
     rng, rows = np.random.default_rng(2), []
     for k in range(recordings):
         gap_m, speed_mps = rng.uniform(4, 12), rng.uniform(14, 22)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, strategies as st
 from scipy import stats
 
-from ethbrake_marl.evaluation.statistics import decrease, difference, mean, rate, unpaired, wilson
+from ethbrake_marl.evaluation.statistics import decrease, difference, mean, rate, unpaired_difference, wilson
 from ethbrake_marl.files.sheet import Estimate
 
 T_2 = 4.302652729911275  # quantile of Student's t with 2 degrees of freedom at 97.5 %
@@ -150,12 +150,12 @@ def test_interval__by_few_unequal_recordings_covers_the_truth(
 
 def test_unpaired_by_hand() -> None:
     one, other = Estimate(5.0, (0.0, 9.0), 2.0, 8.0), Estimate(4.0, None, 1.5, 3.0)
-    found = unpaired(one, other)
+    found = unpaired_difference(one, other)
     freedom = 2.5**4 / (2.0**4 / 8 + 1.5**4 / 3)
     assert (found.value, found.error, found.freedom) == pytest.approx((1.0, 2.5, freedom))
     assert found.interval == pytest.approx(
         (1 - 2.5 * stats.t.ppf(0.975, freedom), 1 + 2.5 * stats.t.ppf(0.975, freedom))
     )
-    assert unpaired(one, Estimate(4.0, (3.0, 5.0))).interval is None
+    assert unpaired_difference(one, Estimate(4.0, (3.0, 5.0))).interval is None
     same = Estimate(2.0, (2.0, 2.0), 0.0, 8.0)
-    assert unpaired(same, same).interval == (0.0, 0.0)
+    assert unpaired_difference(same, same).interval == (0.0, 0.0)

@@ -42,7 +42,7 @@ class Draws:
 
 
 def driving_lines(key: int, n: int, N: int) -> tuple[Floats, Floats]:
-    """Return n lines, some of which touch or rest at the start."""
+    """Lines, [n], some of which touch or rest at the start."""
     draws = Draws(key)
     gaps = draws.uniform(0.2, 10.0, (n, N - 1)) * draws.choice([1.0] * 9 + [0.0], (n, N - 1))
     speeds = draws.uniform(5.0, 25.0, (n, N)) * draws.choice([1.0] * 19 + [0.0], (n, N))
@@ -52,7 +52,7 @@ def driving_lines(key: int, n: int, N: int) -> tuple[Floats, Floats]:
 
 
 def columns(N: int, n: int) -> tuple[Floats, ...]:
-    """Return final gaps and speeds, harm by both counts and number of impacts, of n lines of N vehicles."""
+    """Final gaps and speeds, harm by both counts and number of impacts, of n lines of N vehicles."""
     line, car = driving_lines(1_000 + N, n, N)
     draws, start = Draws(2_000 + N), 0.0
     for until in UNTIL_S:
@@ -64,7 +64,7 @@ def columns(N: int, n: int) -> tuple[Floats, ...]:
 
 
 def figures(name: str) -> dict[str, str | int | float]:
-    """Return the digest of all columns, and rounded sums over all worlds."""
+    """Digest of all columns, and rounded sums over all worlds."""
     digest, results = hashlib.sha256(), [columns(N, n) for N, n in WORLDS[name].items()]
     for arrays in results:
         for array in arrays:

@@ -30,7 +30,7 @@ def lines(
     force_mps2: Any = 0.0,
     **settings: Any,
 ) -> tuple[Floats, Floats]:
-    """Return ``line`` and ``car`` of n worlds of N vehicles; a setting is a number, [N] or [n, N]."""
+    """``line`` and ``car`` of n worlds of N vehicles; a setting is a number, [N] or [n, N]."""
     speeds = np.atleast_2d(np.asarray(speeds_mps, np.float64))
     n, N = speeds.shape
     line, car = np.zeros((n, at.LINE_ROWS, N + 1)), np.zeros((n, at.CAR_ROWS, N + 1))
@@ -44,7 +44,7 @@ def lines(
 
 
 def driven(line: Floats, car: Floats, command: Any, start: Any, until: Any) -> tuple[Floats, Floats, Floats]:
-    """Return the lines after an interval, what ``move_line`` met, and its scratch memory [n, ROWS, N + 1]."""
+    """Lines after an interval, what ``move_line`` met, and its scratch memory [n, SCRATCH_ROWS, N + 1]."""
     n, bodies = len(line), line.shape[2]
     wanted, after, met, scratch = np.zeros((n, bodies)), line.copy(), np.zeros(n, np.int64), scratch_for(bodies)
     wanted[:, 1:] = command

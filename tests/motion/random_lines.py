@@ -28,7 +28,7 @@ class Runs(NamedTuple):
 
 
 def random_runs(rng: np.random.Generator, n: int, N: int, *, builds_up: bool, obstacle: bool) -> Runs:
-    """Return worlds with masses from 0.5 to 40 t, any latency, vehicles that touch, rest, drive at the limit."""
+    """Worlds with masses from 0.5 to 40 t, any latency, vehicles that touch, rest, drive at the limit."""
 
     def some(share: float, these: Floats, others: Floats) -> Floats:
         return np.where(rng.random(these.shape) < share, these, others)
@@ -68,7 +68,7 @@ def played(runs: Runs) -> Floats:
 
 
 def stepped(runs: Runs, step_s: float) -> Floats:
-    """Return the lines at the end by small steps; NaN where these do not come to an end."""
+    """Lines at the end by small steps; NaN where these do not come to an end."""
     out = runs.line.copy()
     for k, (line, car) in enumerate(zip(runs.line, runs.car, strict=True)):
         gaps = [infinite_where_far(line[at.GAP, 0]), *line[at.GAP, 1:-1]]
@@ -85,7 +85,7 @@ def stepped(runs: Runs, step_s: float) -> Floats:
 
 
 def differences(one: Floats, other: Floats) -> Floats:
-    """Return the largest relative difference of each world in speeds, forces, gaps and both counts of harm, [n]."""
+    """Largest relative difference of each world in speeds, forces, gaps and both counts of harm, [n]."""
     rows = [at.SPEED, at.FORCE, at.GAP, at.FIRST, at.TOTAL]
     return largest(one, other, rows)
 
@@ -99,7 +99,7 @@ def passed_differences(one: Floats, other: Floats) -> Floats:
 
 
 def pushes_off(runs: Runs, close: float) -> tuple[Floats, np.ndarray]:
-    """Return how far pushes are from those by small steps, and in which worlds these have the same impacts, [n].
+    """How far pushes are from those by small steps, and in which worlds these have the same impacts, [n].
 
     Steps are 1e-4 s. Worlds further off than ``close`` have an event within a step, whose error falls with the length
     of the step: they are extrapolated from two lengths. Small steps miss the last of many impacts.
@@ -125,7 +125,7 @@ def largest(one: Floats, other: Floats, rows: list[int]) -> Floats:
 
 
 def exactly(runs: Runs, k: int) -> Floats:
-    """Return the line of world k, whose brakes act at once, at the end in rational arithmetic."""
+    """Line of world k, whose brakes act at once, at the end in rational arithmetic."""
     line, car = runs.line[k].copy(), runs.car[k]
     mass, limit = (rationals(car[row, 1:]) for row in (at.MASS, at.LIMIT))
     gaps, speeds = rationals(line[at.GAP, 1:-1]), rationals(line[at.SPEED, 1:])

@@ -56,7 +56,7 @@ class Path:
         self.roots = 0
 
     def decide(self, condition: Any) -> bool:
-        """Return whether a condition holds on this path. If both are possible, store the other branch for later."""
+        """Whether a condition holds on this path. If both are possible, store the other branch for later."""
         if self.next < len(self.decided):
             holds = self.decided[self.next]
         else:
@@ -124,7 +124,7 @@ class SymbolicMath:
 
     @staticmethod
     def sqrt(value: Any) -> Symbol:
-        """Return the root: a new symbol, at least 0, whose square is the value."""
+        """Root: a new symbol, at least 0, whose square is the value."""
         path, square = _PATH[-1], exact(value)
         if not holds_always(path.known, square >= 0):
             raise AssertionError(f"the root of what may be negative: {square}")
@@ -135,7 +135,7 @@ class SymbolicMath:
 
     @staticmethod
     def isnan(value: Any) -> bool:
-        """Return False: a symbol is a number."""
+        """False: a symbol is a number."""
         return not isinstance(value, Symbol) and math.isnan(value)
 
 
@@ -147,12 +147,12 @@ class Ended(NamedTuple):
 
 
 def is_infinite(value: Any) -> bool:
-    """Return whether a value is a number and infinite, not a symbol."""
+    """Whether a value is a number and infinite, not a symbol."""
     return isinstance(value, float) and math.isinf(value)
 
 
 def exact(value: Any) -> Any:
-    """Return the expression of a symbol, or the exact value of a number."""
+    """Expression of a symbol, or the exact value of a number."""
     if isinstance(value, Symbol):
         return value.expression
     if isinstance(value, float | int):
@@ -162,7 +162,7 @@ def exact(value: Any) -> Any:
 
 
 def symbols(names: str) -> list[Symbol]:
-    """Return one symbol per name."""
+    """One symbol per name."""
     return [Symbol(z3.Real(name)) for name in names.split()]
 
 
@@ -181,7 +181,7 @@ def paths(function: Callable[[], Any], known: list[Any]) -> Iterator[Ended]:
 
 
 def possible(statements: list[Any]) -> bool:
-    """Return whether all conditions can hold together. If the solver cannot decide, the answer is True."""
+    """Whether all conditions can hold together. If the solver cannot decide, the answer is True."""
     solver = z3.Solver()
     solver.set("timeout", PATIENCE_MS)
     solver.add(*statements)
@@ -189,7 +189,7 @@ def possible(statements: list[Any]) -> bool:
 
 
 def holds_always(known: list[Any], statement: Any) -> bool:
-    """Return whether a statement follows from the known conditions; False if the solver cannot decide."""
+    """Whether a statement follows from the known conditions; False if the solver cannot decide."""
     return not possible([*known, z3.Not(statement)])
 
 
@@ -251,7 +251,7 @@ def stopping() -> int:
 
 
 def _cluster(vehicles: int, closing: float) -> tuple[list[Symbol], list[Symbol], Symbol, list[Ended]]:
-    """Return masses, speeds, restitution, and every path of an impact of touching vehicles; results are new speeds."""
+    """Masses, speeds, restitution, and every path of an impact of touching vehicles; results are new speeds."""
     mass = symbols(" ".join(f"m{i}" for i in range(vehicles)))
     speed = symbols(" ".join(f"v{i}" for i in range(vehicles)))
     (restitution,) = symbols("e")
@@ -268,7 +268,7 @@ def _cluster(vehicles: int, closing: float) -> tuple[list[Symbol], list[Symbol],
 
 
 def _sum(*columns: list[Symbol]) -> Any:
-    """Return the sum over vehicles of the product of these values."""
+    """Sum over vehicles of the product of these values."""
     return sum(math.prod((exact(x) for x in row), start=exact(1)) for row in zip(*columns, strict=True))
 
 

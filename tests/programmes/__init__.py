@@ -41,7 +41,7 @@ class NotInstalled(Exception):
 def ready_python(
     name: str, requires: Sequence[str], overrides: Sequence[str] = (), *, project: bool = True, torch: bool = True
 ) -> Path:
-    """Return the Python of an environment that has ``requires``. Make the environment if it does not exist.
+    """Python of an environment that has ``requires``. Make the environment if it does not exist.
 
     ``overrides``: versions that replace the requirements of these packages. ``project``: install this project, too.
     Raises ``NotInstalled``.
@@ -103,7 +103,7 @@ def call_uv(command: list[str]) -> None:
 
 
 def watched(command: Sequence[str], limit: float, **variables: str) -> tuple[int | None, str]:
-    """Return exit status (None after ``limit`` seconds) and output of a command. Its child processes end with it."""
+    """Exit status (None after ``limit`` seconds) and output of a command. Its child processes end with it."""
     given = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
     with subprocess.Popen(
         command, cwd=ROOT, env=given, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,

@@ -19,7 +19,7 @@ FOLDER = Path(__file__).parent
 
 
 def programmes() -> dict[str, str]:
-    """Return the first line of each programme's docstring, by name."""
+    """First line of each programme's docstring, by name."""
     texts = {file.stem: file.read_text("utf-8") for file in sorted(FOLDER.glob("*.py"))}
     return {name: text.partition("\n")[0].strip('"') for name, text in texts.items() if "\ndef cases(" in text}
 

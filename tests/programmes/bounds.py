@@ -76,7 +76,7 @@ def attempt(kind: str, python: str, paths: list[str], until: float) -> Told:
 
 
 def make_environment(kind: str, python: str) -> Path:
-    """Return the Python of a new environment. Raises ``NotInstalled``, also if this machine lacks that Python."""
+    """Python of a new environment. Raises ``NotInstalled``, also if this machine lacks that Python."""
     resolution, _, light = kind.partition("-")
     there = KEPT / f"{kind}-{Path(python).name}" / "bin" / "python"
     install = new_environment(there, python)
@@ -90,7 +90,7 @@ def make_environment(kind: str, python: str) -> Path:
 
 
 def untried_bounds(python: Path, light: bool) -> list[str]:
-    """Return bounds of ``pyproject.toml`` below the installed versions. torch's version is fixed."""
+    """Bounds of ``pyproject.toml`` below the installed versions. torch's version is fixed."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = () if light else EXTRAS
     asked = [*project["dependencies"], *(each for extra in extras for each in project["optional-dependencies"][extra])]

@@ -41,12 +41,12 @@ class Bug(NamedTuple):
 
 
 def planted() -> list[Bug]:
-    """Return the bugs of ``bugs.yaml``."""
+    """Bugs of ``bugs.yaml``."""
     return [Bug(name, patches) for name, patches in yaml.safe_load(BUGS.read_text("utf-8")).items()]
 
 
 def misfits() -> list[str]:
-    """Return the patches whose old text is not in its file exactly once."""
+    """Patches whose old text is not in its file exactly once."""
     found = []
     for name, patches in planted():
         for file, old, _ in patches:
@@ -57,7 +57,7 @@ def misfits() -> list[str]:
 
 
 def near(file: str) -> list[str]:
-    """Return the tests of the folder of a file of the package: those to run first."""
+    """Tests of the folder of a file of the package: those to run first."""
     folder = PurePosixPath("tests") / PurePosixPath(file).parent
     return [str(folder)] if folder.name != "tests" else [str(p.relative_to(ROOT)) for p in ROOT.glob("tests/test_*.py")]
 
@@ -87,7 +87,7 @@ def copy_of_the_repository(folder: Path) -> Path:
 
 
 def finder(bug: Bug, copies: SimpleQueue[Path]) -> str:
-    """Return the first test that fails with a bug; empty if none fails."""
+    """First test that fails with a bug; empty if none fails."""
     copy = copies.get()
     try:
         with changed(bug, copy):
@@ -119,7 +119,7 @@ def changed(bug: Bug, copy: Path) -> Iterator[None]:
 
 
 def failing(copy: Path, tests: list[str]) -> str:
-    """Return the first of these tests that fails in a copy; empty if all pass."""
+    """First of these tests that fails in a copy; empty if all pass."""
     kernels = copy.with_name(f"{copy.name}-kernels")
     variables = {"PYTHONPATH": str(copy), "NUMBA_CACHE_DIR": str(kernels), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-B", *PYTEST, *tests]

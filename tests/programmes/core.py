@@ -71,7 +71,7 @@ def passes_without(gone: set[str], folder: Path) -> Told:
 
 
 def users_of(extension: str) -> set[str]:
-    """Return an extension and all extensions that need it, directly or indirectly."""
+    """An extension and all extensions that need it, directly or indirectly."""
     uses, gone = {each: used | BY_NAME.get(each, set()) for each, used in arrows().items()}, {f"extensions.{extension}"}
     while more := {each for each, used in uses.items() if each.startswith("extensions.") and used & gone} - gone:
         gone |= more

@@ -147,7 +147,7 @@ def write(found: dict[str, Told]) -> Told:
 
 
 def with_table(page: str, found: dict[str, Told]) -> str:
-    """Return the page with a table of what was found in place of its last section."""
+    """Page with a table of what was found in place of its last section."""
     rows = "\n".join(f"| {name} | {told.text} |" for name, told in found.items() if told.good)
     measured = f"Measured: {date.today()}, by `make programme NAME=cuda`."
     return f"{page.partition(HEADING)[0]}{HEADING}\n| check | result |\n|---|---|\n{rows}\n\n{measured}\n"

@@ -20,7 +20,7 @@ from tests.programmes import Cases, Given, Told
 
 
 def run(command: str, folder: Path) -> str:
-    """Return the output of a command: stderr, then stdout. Raises ``RuntimeError`` if the command fails."""
+    """Output of a command: stderr, then stdout. Raises ``RuntimeError`` if the command fails."""
     words = shlex.split(command)
     words[1:] = [str(ROOT / word) if word.startswith("docs/studies/") else word for word in words[1:]]
     called = [sys.executable, *(["-m", "ethbrake_marl"] if words[0] == "ethbrake" else []), *words[1:]]
@@ -33,13 +33,13 @@ def run(command: str, folder: Path) -> str:
 
 @cache
 def told_by(command: str) -> str:
-    """Return the output of a command, cached, because several tables may use it."""
+    """Output of a command, cached, because several tables may use it."""
     with tempfile.TemporaryDirectory() as folder:
         return run(command, Path(folder))
 
 
 def differing_picture(picture: Shown, folder: Path) -> list[str]:
-    """Return in words whether a picture has other pixels; empty if not."""
+    """Difference between the pixels of an old and a new picture, in words; empty if there is none."""
     for command in picture.commands:
         run(command, folder)
     old, new = (

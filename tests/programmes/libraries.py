@@ -65,7 +65,7 @@ class Library(NamedTuple):
 
 
 def ways() -> list[Way]:
-    """Return all programs, in the order of the page."""
+    """All programs, in the order of the page."""
     found = []
     for section in PAGE.read_text("utf-8").split("\n## ")[1:]:
         for each in BLOCK.finditer(section):
@@ -80,7 +80,7 @@ def ways() -> list[Way]:
 
 
 def deterministic(policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a policy of TorchRL without exploration."""
+    """Policy of TorchRL without exploration."""
     import torch
     from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -237,7 +237,7 @@ def tell(k: int) -> None:
 
 
 def harm_of_programs() -> dict[str, dict[str, float]]:
-    """Return the mean harm of full braking and of each policy of docs/train.md and docs/extensions/benchmarl.md.
+    """Mean harm of full braking and of each policy of docs/train.md and docs/extensions/benchmarl.md.
 
     Without BenchMARL only the programs of docs/train.md run. MAPPO need not beat full braking: the page says that a
     minute is too short.
@@ -259,7 +259,7 @@ def tell_programs() -> None:
 
 
 def evaluated_by_itself(model: Any, agent: Any) -> float:
-    """Return the largest difference in a world's harm between our and the library's evaluation, m2/s2.
+    """Largest difference in a world's harm between our and the library's evaluation, m2/s2.
 
     The library's ``evaluate_policy`` gives returns, which are minus the harm.
     """
@@ -277,7 +277,7 @@ def evaluated_by_itself(model: Any, agent: Any) -> float:
 
 
 def cpu_seconds() -> float:
-    """Return the processor seconds of this process and of its ended children."""
+    """Processor seconds of this process and of its ended children."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 
@@ -327,5 +327,5 @@ def run(library: str, function: str, given: Given) -> Told:
 
 
 def lowered(title: str) -> str:
-    """Return a title as it is written in the table."""
+    """Title as it is written in the table."""
     return title if title[:2].isupper() else title[0].lower() + title[1:]

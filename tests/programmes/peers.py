@@ -33,7 +33,7 @@ SETTINGS = {  # one thread for every library: threads that wait also cost proces
 
 
 def rates(work: Work, repetitions: int = REPETITIONS, seconds: float = SECONDS) -> list[float]:
-    """Return units of work per second of processor time, ascending. The first round does not count."""
+    """Units of work per second of processor time, ascending. The first round does not count."""
     work()
     found = []
     for _ in range(repetitions):
@@ -46,7 +46,7 @@ def rates(work: Work, repetitions: int = REPETITIONS, seconds: float = SECONDS) 
 
 
 def ours(name: str, n: int) -> Work:
-    """Return a loop of ``docs/studies/speed.py``."""
+    """Loop of ``docs/studies/speed.py``."""
     work: Work = getattr(load("../studies/speed"), name)(n)
     return work
 
@@ -203,7 +203,7 @@ def measured(name: str, medians: dict[str, float]) -> Told:
 
 
 def plain(value: float) -> str:
-    """Return a number with three digits, and with commas from 1,000 on."""
+    """Number with three digits, and with commas from 1,000 on."""
     return f"{float(f'{value:.3g}'):,.{0 if value >= 99.95 else 1 if value >= 9.995 else 2}f}"
 
 

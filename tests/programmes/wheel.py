@@ -85,7 +85,7 @@ ABSENT = "assert not {'torch', 'stable_baselines3', 'tensorboard'} & set(sys.mod
 
 
 def readme_example() -> Call:
-    """Return the first Python program of the README as a call."""
+    """First Python program of the README as a call."""
     found = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
     return Call(("python", "-c", found[1]))
 
@@ -145,7 +145,7 @@ def install(environment: Path, file: Path) -> set[tuple[str, str]]:
 
 
 def installed_mb(environment: Path) -> float:
-    """Return the size of the installed packages in MB (10^6 bytes), without those of an empty environment."""
+    """Size of the installed packages in MB (10^6 bytes), without those of an empty environment."""
     (packages,) = environment.glob("lib/python*/site-packages")
     parts = [part for part in packages.iterdir() if not part.name.startswith(NOT_OURS)]
     files = [file for part in parts for file in ([part] if part.is_file() else part.rglob("*"))]

@@ -42,7 +42,7 @@ RATES = {"brake_rate_mps3": {"uniform": [5, 40]}, "release_rate_mps3": {"uniform
 
 
 def line(name: str, **roles: str) -> Scenario:
-    """Return a shipped scenario; with ``-rates`` behind its name, brakes build up; ``roles`` change vehicles."""
+    """Shipped scenario; with ``-rates`` behind its name, brakes build up; ``roles`` change vehicles."""
     register_agent("following", make_follower, form="following")
     scenario = load_scenario(name.removesuffix("-rates"))
     scenario = scenario.replace(**RATES) if name.endswith("-rates") else scenario

@@ -30,7 +30,7 @@ Made = Callable[[str], Any]
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """Return a function that tells what an uninterrupted training leaves."""
+    """Function that tells what an uninterrupted training leaves."""
     made: dict[str, dict[str, Any]] = {}
 
     def get(name: str) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def test_train__other_vehicles_are_driven_by_the_agents_that_roles_name(tmp_path
 
 
 def history(folder: Path) -> list[dict[str, str]]:
-    """Return the hashes of the weights of two independent learners before the first update and after each one."""
+    """Hashes of the weights of two independent learners before the first update and after each one."""
     seen: list[dict[str, str]] = []
 
     def note(policies: Any) -> dict[str, float]:
@@ -84,7 +84,7 @@ def test_independent__each_learns_from_its_own_rewards_only(tmp_path: Path, monk
 
 
 def model_of(scheme: str) -> tuple[Any, Any]:
-    """Return the policy in training, and its environment."""
+    """Policy in training, and its environment."""
     training = Training.of(SHORT, PAIR, scheme=scheme)
     environment = make_environment(training)
     return algorithm_of(training.recipe).build(training, environment).policy, environment

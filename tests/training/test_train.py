@@ -198,7 +198,7 @@ def test_train__objectives_decide_where_they_are_not_the_harm_of_the_line(tmp_pa
 
 
 def closed() -> Any:
-    """Return a stream that is closed."""
+    """Stream that is closed."""
     stream = io.StringIO()
     stream.close()
     return stream
@@ -324,7 +324,7 @@ class A2cRecipe(TrainingRecipe):
     network: Any = None
 
     def network_spec(self, observation_size: int) -> Any:
-        """Return PPO's: A2C has the same networks."""
+        """PPO's: A2C has the same networks."""
         return TINY.network_spec(observation_size)
 
 
@@ -332,7 +332,7 @@ class A2c(Algorithm):
     """An algorithm of a user: only what must be written."""
 
     def build(self, training: Any, environment: Any) -> A2C:
-        """Return the model."""
+        """Model."""
         recipe = training.recipe
         return A2C(
             "MlpPolicy",
@@ -368,7 +368,7 @@ class Gambling(A2c):
     """Moves a weight, after every update, by random numbers of all generators that a user may have used."""
 
     def build(self, training: Any, environment: Any) -> A2C:
-        """Return the model."""
+        """Model."""
         model = super().build(training, environment)
         learn = model.train
 
@@ -403,7 +403,7 @@ class OnDevice(A2c):
     """A variant of A2C for another device."""
 
     def build(self, training: Any, environment: Any) -> A2C:
-        """Return the model, and remember the device."""
+        """Model; the device is remembered."""
         DEVICES.append(training.recipe.device)
         return super().build(training, environment)
 

@@ -61,7 +61,7 @@ def die() -> None:
 
 
 def dying_after(updates: int) -> Callable[[Progress], None]:
-    """Return a listener that kills the process when so many updates are done and reported."""
+    """Listener that kills the process when so many updates are done and reported."""
     return lambda progress: die() if progress.updates >= updates else None
 
 
@@ -76,7 +76,7 @@ def go_on(run: Path, **settings: Any) -> Any:
 
 
 def kept(run: Path) -> dict[str, Any]:
-    """Return what a run leaves, without clocks: policies and rows of progress."""
+    """What a run leaves, without clocks: policies and rows of progress."""
     lines = (run / "progress.csv").read_text().splitlines()
     names = lines[0].split(",")
     rows = [

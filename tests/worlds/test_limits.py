@@ -54,17 +54,17 @@ FORMS: dict[str, Callable[[float, float], Any]] = {  # of a value and of another
 
 
 def below(key: str) -> float:
-    """Return the largest number that is too small."""
+    """Largest number that is too small."""
     return math.nextafter(RANGES[key][0], -math.inf)
 
 
 def above(key: str) -> float:
-    """Return the smallest number that is too large."""
+    """Smallest number that is too large."""
     return math.nextafter(3600.0 if RANGES[key][1] == IN_TIME else RANGES[key][1], math.inf)
 
 
 def ends(key: str, value: float) -> dict[str, Any]:
-    """Return what fits a value that is the end of a range of speeds."""
+    """What fits a value that is the end of a range of speeds."""
     return {"line_speed_mps": 200.0 if value < 0.0 else 0.0} if key == "speed_deviations_mps" else {}
 
 

@@ -10,7 +10,7 @@ import pytest
 from ethbrake_marl.episode.state import NUMBER
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.describe import quantities_of
-from ethbrake_marl.worlds.user_worlds import given_columns, read_worlds, worlds_from_state, worlds_from_table
+from ethbrake_marl.worlds.user_worlds import read_worlds, world_columns, worlds_from_state, worlds_from_table
 from tests.refused import refused
 from tests.worlds.test_scenario import bits, line
 
@@ -136,4 +136,4 @@ def test_file__may_hold_any_quantity_in_any_order(empty_folder: Path) -> None:
     assert worlds.latency_s.tolist() == [[0.0, 0.2, 0.8]]
     assert worlds.mass_t.tolist() == [[4.5, 5.5, 6.0]]
     assert worlds.speeds_mps.tolist() == [[20.0, 18.0, 20.0]]
-    assert [*given_columns(PAPER)][:6] == [*HEADER.split(","), "braking_capacity_1_mps2"]
+    assert [*world_columns(PAPER)][:6] == [*HEADER.split(","), "braking_capacity_1_mps2"]

@@ -155,11 +155,11 @@ def measure(plan: Ablation, tell: OnProgress) -> list[LevelResult]:
     measured: list[LevelResult] = []
     for pair_number, (level, drawn_worlds, algorithm) in enumerate(pairs):
         tell(Progress(f"driving {level.name}", pair_number, len(pairs)))
-        measured.append(driven(level, drawn_worlds, algorithm, trained.get((level.name, algorithm), ())))
+        measured.append(measure_level(level, drawn_worlds, algorithm, trained.get((level.name, algorithm), ())))
     return measured
 
 
-def driven(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None, jobs: Any) -> LevelResult:
+def measure_level(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None, jobs: Any) -> LevelResult:
     """Results of one level if the teams that ``jobs`` have trained drive its worlds.
 
     Full braking of all learners is measured for comparison. Without jobs, only the scripts drive. ``algorithm``: name
@@ -208,7 +208,7 @@ class Answer(NamedTuple):
     game: Game
     worlds: State  # at the alert, in which the joint optimum was searched, [m]
     searched: BestHarmTable
-    driven: Mapping[str, Sequence[Floats]]  # count -> harm of each trained team, [m]
+    team_harm: Mapping[str, Sequence[Floats]]  # count -> harm of each trained team, [m]
 
 
 def with_optima(plan: Ablation, measured: Sequence[LevelResult], threads: int, tell: OnProgress) -> list[LevelResult]:
@@ -264,8 +264,8 @@ def least_known(answer: Answer, answers: Iterable[Answer], count: str) -> Floats
                 harm = problem.follow(profiles.take(rows)).harm(count)
                 best[rows] = np.minimum(best[rows], harm)
             same = rows[original.worlds.line[rows, GAP, 0] == answer.worlds.line[rows, GAP, 0]]
-            for team_harm in original.driven[count]:
-                best[same] = np.minimum(best[same], team_harm[same])
+            for harm in original.team_harm[count]:
+                best[same] = np.minimum(best[same], harm[same])
     return best
 
 

@@ -30,7 +30,7 @@ class Graphed:
                 return self._beside(*tensors)
             if self.calls == WARM_UP + 1:
                 self._record(*tensors)
-            for buffer, tensor in zip(self.given, tensors, strict=True):
+            for buffer, tensor in zip(self.inputs, tensors, strict=True):
                 buffer.copy_(tensor)
             self.graph.replay()
         return self.result
@@ -45,10 +45,10 @@ class Graphed:
         return result
 
     def _record(self, *tensors: Tensor) -> None:
-        self.given = [tensor.clone() for tensor in tensors]
+        self.inputs = [tensor.clone() for tensor in tensors]
         self.graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self.graph, stream=new_stream()):
-            self.result = self.function(*self.given)
+            self.result = self.function(*self.inputs)
 
 
 def new_stream() -> torch.cuda.Stream:

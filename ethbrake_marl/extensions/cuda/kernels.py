@@ -48,7 +48,7 @@ class Results(NamedTuple):
     status: Any  # [n] FINE, NO_ACTION or PHYSICS_FAILED
 
 
-class Ruling(NamedTuple):
+class KernelSettings(NamedTuple):
     """Settings of a game that a step needs, as in ``StepSettings``."""
 
     learners: Any  # [L]
@@ -139,7 +139,7 @@ def play_world(t, memory, stored, pool, following, actions, results, settings, v
     ``memory`` is the memory of this thread. ``stored`` contains the running episodes, ``pool`` the worlds in which
     episodes begin; ``following`` [n] is the number of the world in the pool in which the next episode begins.
     ``actions`` [n, L] float32 are clipped to [-1, 1]. If an action is NaN, nothing moves in this world and
-    ``results.status`` says so. ``settings``: a ``Ruling``. ``view``: a ``ViewArrays``.
+    ``results.status`` says so. ``settings``: a ``KernelSettings``. ``view``: a ``ViewArrays``.
     """
     load_world(t, stored, memory)
     is_new = mode == BEGIN

@@ -21,8 +21,8 @@ from ethbrake_marl.extensions.cuda.kernels import (
     PHYSICS_FAILED,
     RENEW,
     STEP_MODE,
+    KernelSettings,
     Results,
-    Ruling,
     StoredEpisodes,
     ViewArrays,
     memory_of,
@@ -100,7 +100,7 @@ class Worlds:
         first = self.game.reset(worlds)
         self.longest = int(first.clock[:, LAST].max())  # decisions of the longest episode
         self.view = self.game.views[int(self.game.settings.learners[0])]
-        self.settings, self.looking, self.kernel = kernel_of(self.game, first.vehicles + 1, self.device)
+        self.settings, self.view_arrays, self.kernel = kernel_of(self.game, first.vehicles + 1, self.device)
         L, F = len(self.game.settings.learners), len(self.view.names)
         with enough_memory(f"n = {n} worlds, and a pool of {first.n}, on device {str(self.device)!r}"):
             self.pool = self.stored(first)
@@ -172,7 +172,7 @@ class Worlds:
         return self.observations
 
     def arguments(self, actions: Tensor, mode: int) -> tuple[Any, ...]:
-        return self.now, self.pool, self.following, actions, self.results, self.settings, self.looking, mode
+        return self.now, self.pool, self.following, actions, self.results, self.settings, self.view_arrays, mode
 
     def _launch(self, actions: Tensor, mode: int) -> None:
         self.kernel.launch(self.device, self.n, *self.arguments(actions, mode))
@@ -235,20 +235,20 @@ def check_runs(game: Game) -> None:
         )
 
 
-def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, ViewArrays, Kernel]:
+def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[KernelSettings, ViewArrays, Kernel]:
     """Settings and features of a game as constant arguments of the kernel ``play_world``, and this kernel.
 
     ``bodies``: number of bodies (the vehicles and the obstacle).
     """
     on = partial(torch.tensor, device=device)
     settings, plan = game.settings, game.views[int(game.settings.learners[0])].plan
-    ruling = Ruling(
+    kernel_settings = KernelSettings(
         on(settings.learners),
         float(settings.time_step_s),
         float(settings.harm),
         float(settings.terminal),
         on(settings.weights),
     )
-    looking = ViewArrays(on(plan.offsets), plan.role, plan.obstacle, on(plan.places), on(plan.scaling))
+    view_arrays = ViewArrays(on(plan.offsets), plan.role, plan.obstacle, on(plan.places), on(plan.scaling))
     size = bodies, len(settings.learners), plan.scaling.shape[1], len(plan.offsets)
-    return ruling, looking, Kernel(size, memory_of(*size))
+    return kernel_settings, view_arrays, Kernel(size, memory_of(*size))

@@ -62,11 +62,11 @@ class Chooser(AveragedNetwork):
     memory: ReplayBuffer  # seen [F]; tried [C]: numbers of choices, the chooser's first; more [C]: their extra costs
 
     def __init__(self, inputs: int, recipe: RolloutClassificationRecipe) -> None:
-        shape, self_tried = recipe.network, 1 + recipe.others
+        shape, tried_count = recipe.network, 1 + recipe.others
         average = zero_last_layer(perceptron(inputs, shape.choices, shape.policy, shape.activation))
         super().__init__(average, copy.deepcopy(average), recipe.learning_rate.at(1.0))
         self.actions = recipe.network_spec(inputs).actions
-        columns = {"tried": torch.zeros(self_tried, dtype=torch.int64), "more": torch.zeros(self_tried)}
+        columns = {"tried": torch.zeros(tried_count, dtype=torch.int64), "more": torch.zeros(tried_count)}
         self.memory = ReplayBuffer(recipe.memory, seen=torch.zeros(inputs), **columns)
 
     def act(self, observations: Float32s) -> Float32s:

@@ -44,10 +44,10 @@ def start_weights(policy: Policy, network: NetworkSpec, features: Sequence[str],
             f"recipe {recipe!r}: the observation lacks the features {', '.join(missing[:5])}, which the policy of the"
             " key start observes; add them to the observation"
         )
-    return widened(policy, features)
+    return widen(policy, features)
 
 
-def widened(policy: Policy, features: Sequence[str]) -> dict[str, Float32s]:
+def widen(policy: Policy, features: Sequence[str]) -> dict[str, Float32s]:
     """Weights of the policy's actor for observations ``features``; 0 for features that the policy did not observe."""
     tensors = {name: tensor.copy() for name, tensor in policy.tensors.items() if name.startswith("policy.")}
     first = np.zeros((len(tensors["policy.0.weight"]), len(features)), np.float32)

@@ -56,12 +56,12 @@ class MessagesLayer(Layer):
         if not alert.memories[MESSAGES_KEY].is_periodic:
             return state
         sent = partial(game.seen, body=0, before=self)
-        return _remembering(state, begin_messages(alert, state.time_s, game.settings.time_step_s, sent))
+        return _with_memory(state, begin_messages(alert, state.time_s, game.settings.time_step_s, sent))
 
     def after(self, game: Game, before: State, state: State) -> State:
         if not before.memories[MESSAGES_KEY].is_periodic:
             return state
-        return _remembering(state, after_step(before, state, partial(game.seen, body=0, before=self)))
+        return _with_memory(state, after_step(before, state, partial(game.seen, body=0, before=self)))
 
     def seen(self, state: State, body: int) -> State:
         return belief_of(state, body)
@@ -98,7 +98,7 @@ class MessagesLayer(Layer):
 MESSAGES_LAYER = MessagesLayer()
 
 
-def _remembering(state: State, memory: MessageMemory) -> State:
+def _with_memory(state: State, memory: MessageMemory) -> State:
     return state._replace(memories={**state.memories, MESSAGES_KEY: memory})
 
 

@@ -49,7 +49,7 @@ OBSTACLE_HIT = 4  # 1 once Vehicle 1 has hit the obstacle
 INTENT = 5  # command chosen at the last decision (m/s2); the rows before it can be measured
 SAMPLE_ROWS = 6
 
-# columns of `Memory.channel`
+# columns of `MessageMemory.channel`
 PERIOD = 0  # time between two messages of a link (s); 0: what is known is always the present state
 DELAY = 1  # time from sending a message to its use (s)
 LOSS_BEGINS = 2  # p
@@ -57,7 +57,7 @@ LOSS_ENDS = 3  # r
 KEY = 4  # whole number below 2^53 that decides which messages are lost
 CHANNEL_COLUMNS = 5
 
-# rows of `Memory.links`
+# rows of `MessageMemory.links`
 SENT = 0  # time at which the next message is sent (s); infinite: none
 MESSAGE_NUMBER = 1  # its number; message 0 always arrives
 BAD = 2  # 1 while the link is bad
@@ -146,7 +146,7 @@ def begin_messages(alert: State, start_s: Floats, time_step_s: float, sent: Call
     steps = np.ceil(start_s / time_step_s - 1e-6)
     for steps_left in range(int(steps.max()) - 1, -1, -1):
         rows = steps > steps_left
-        state, way = _advanced(state, np.where(rows, start_s - steps_left * time_step_s, state.time_s))
+        state, way = _advance(state, np.where(rows, start_s - steps_left * time_step_s, state.time_s))
         _sample(memory, sent(state), way, rows)
     return memory
 
@@ -154,7 +154,7 @@ def begin_messages(alert: State, start_s: Floats, time_step_s: float, sent: Call
 def after_step(before: State, after: State, sent: Callable[[State], State]) -> MessageMemory:
     """Memory after a step, with what was received during the step. ``sent``: as for ``begin_messages``."""
     memory = _writable_copy(before.memories[MESSAGES_KEY])
-    _, way = _advanced(before._replace(wanted=after.wanted), after.time_s)
+    _, way = _advance(before._replace(wanted=after.wanted), after.time_s)
     _sample(memory, sent(after), way, after.time_s > before.time_s)
     return memory
 
@@ -163,7 +163,7 @@ def _writable_copy(memory: MessageMemory) -> MessageMemory:
     return memory._replace(links=memory.links.copy(), news=memory.news.copy(), samples=memory.samples.copy())
 
 
-def _advanced(state: State, until_s: Floats) -> tuple[State, Floats]:
+def _advance(state: State, until_s: Floats) -> tuple[State, Floats]:
     """State at ``until_s`` [n], and the way of Vehicle 1 until then, [n] m.
 
     The way is the amount by which the gap to the obstacle, or to a post far ahead, falls.

@@ -83,7 +83,7 @@ def write_figures(experiment: Experiment) -> list[Markup]:
     """Draw the learning curve, harm against the total gap, and one episode. Write them as PNG; return them as HTML."""
     compared, learned, trained = experiment.compared, experiment.learned, experiment.trained
     recipe, (_, game) = trained.training.recipe, open_game(compared.scenario)
-    typical_row = telling_row(compared, learned)
+    typical_row = typical_row_of(compared, learned)
     world, number = compared.worlds([typical_row]), int(compared.result.worlds["world"][typical_row])
     plan = recipe.evaluation
     counts = dict.fromkeys([*HARM, compared.harm_count])
@@ -128,7 +128,7 @@ def write_figures(experiment: Experiment) -> list[Markup]:
     return [drawing(figure, title, description) for title, description, figure in figures.values()]
 
 
-def telling_row(compared: Compared, learned: str) -> int:
+def typical_row_of(compared: Compared, learned: str) -> int:
     """Row of a typical world: of the worlds in which full braking does harm, the one with the median saving of harm.
 
     The saving is that of the agent ``learned``. Row 0 if full braking does no harm.

@@ -13,7 +13,6 @@ import numpy as np
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import curves_figure
 from ethbrake_marl.extensions.report.style import TITLES
-from ethbrake_marl.extensions.reproduction.learning import unconverged
 from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, NON_E, WORLD_FIELDS, open_reading
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
@@ -23,7 +22,7 @@ from ethbrake_marl.extensions.reproduction.strategies import (
     PAPERS,
     PREDICTED,
     SIMULATED,
-    of_the_process,
+    process_outcomes,
     proven_least_harm,
     strategies,
 )
@@ -56,7 +55,7 @@ def process_lines(reading: Reading, episodes: int, settings: ReproductionSetting
 
     The array is [seeds, n] for a trained policy and [n] for other strategies. Empty if there are no such trainings.
     """
-    outcomes = of_the_process(reading, episodes, settings)
+    outcomes = process_outcomes(reading, episodes, settings)
     trained = {name: np.stack([seed[name]["first"] for seed in seeds]) for name, seeds in outcomes.items()}
     return {**harm_of_strategies(reading._replace(step_s=MAP_STEP_S), episodes, {}), **trained} if outcomes else {}
 
@@ -159,14 +158,14 @@ def growth_between_groups(groups: Groups, name: str) -> list[Less]:
 
 
 DELAYS = ("low", "middle", "high")
-ONE = (("gaps_m", (7.0, 7.0)), ("speeds_mps", (20.0, 18.0, 20.0)))  # the world of the paper's figure
+PAPER_WORLD = (("gaps_m", (7.0, 7.0)), ("speeds_mps", (20.0, 18.0, 20.0)))  # the world of the paper's figure
 
 
 def reproduce_delays(settings: ReproductionSettings) -> Made:
     """Fig. 5: harm of each strategy at three delays, which are our choice, in the one world of the paper's figure."""
     groups, trained, only_world = {}, {}, np.array([True])
     for delay in DELAYS:
-        reading = STATED._replace(base=f"paper-delay-{delay}", others=ONE)
+        reading = STATED._replace(base=f"paper-delay-{delay}", others=PAPER_WORLD)
         _, middle, rear = open_reading(reading.only(*WORLD_FIELDS), 1)[2].latency_s[0]
         name = f"{delay} ({middle:g}, {rear:g} s)"
         groups[name] = harm_of_strategies(reading, 1, settings.policies), only_world
@@ -186,7 +185,7 @@ def reproduce_delays(settings: ReproductionSettings) -> Made:
 
 def reproduce_illustration(settings: ReproductionSettings) -> Made:
     """Fig. 8: harm over the distance, and in how many worlds the hybrid does not pick the strategy of lower harm."""
-    readings = distances(settings, {ALONE: unconverged(settings.folder)})
+    readings = distances(settings, {ALONE: unconverged_policy(settings.folder)})
     hybrid = f"Hybrid {ALONE}"
     counts, shares, texts = [], [], []
     for groups in readings.values():

@@ -103,7 +103,7 @@ def _train(plan: TrainingPlan, run: Path, seed: int, settings: ReproductionSetti
     return result.status == "finished"
 
 
-def unconverged(folder: Path) -> str:
+def unconverged_policy(folder: Path) -> str:
     """Agent name of our PPO policy whose training is stopped after a fifteenth of the recipe's decisions.
 
     It stands for the paper's policy "obtained from training before convergence occurred".

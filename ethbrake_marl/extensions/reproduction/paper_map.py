@@ -172,7 +172,7 @@ class PaperMap:
 
         ``actions``: of the L learners, [n, L] in [-1, 1].
         """
-        before, settings = decided(game, state, actions), game.settings
+        before, settings = with_commands(game, state, actions), game.settings
         after, over = sample(before, settings.time_step_s), state.ended
         np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])
         np.copyto(after.clock, before.clock, where=over[:, np.newaxis])
@@ -190,7 +190,7 @@ class PaperMap:
         return after, Step(reward, out, settings.time_step_s)
 
 
-def decided(game: Game, state: State, actions: Floats | None) -> State:
+def with_commands(game: Game, state: State, actions: Floats | None) -> State:
     """State with the commands that scripts and learners choose at the beginning of a time step.
 
     ``actions``: of the L learners, [n, L]. Raises ``InvalidInput`` unless all are in [-1, 1].

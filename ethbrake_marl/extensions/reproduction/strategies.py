@@ -55,7 +55,7 @@ def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> 
     return outcomes
 
 
-def of_the_process(
+def process_outcomes(
     reading: Reading, episodes: int, settings: ReproductionSettings
 ) -> dict[str, list[dict[str, RandomOutcome]]]:
     """Outcomes in the paper's fixed-step map with policies trained as in the paper.

@@ -8,7 +8,6 @@ import numpy as np
 
 from ethbrake_marl.evaluation.statistics import decrease, mean, rate
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, PaperRow, printed_sheet
-from ethbrake_marl.extensions.reproduction.learning import unconverged
 from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,
@@ -24,7 +23,7 @@ from ethbrake_marl.extensions.reproduction.strategies import (
     PAPERS,
     PREDICTED,
     SIMULATED,
-    of_the_process,
+    process_outcomes,
     proven_least_harm,
     strategies,
 )
@@ -52,7 +51,7 @@ WHY = {  # (row, quantity) -> why ours differs; "": each
     ("", DECREASE): "it follows from the two harms",
     ("", ""): REJECTS,
 }
-GIVEN = {  # what a proof assumes
+PROOF_ASSUMPTIONS = {  # what a proof assumes
     "Table III": "with Vehicle 2 acting at 0.5 s",
     "Table II": "with Vehicle 2 acting at 0.5 s and the speeds of Table III",
 }
@@ -98,7 +97,7 @@ def number_claims(
             why = next(WHY[key] for key in keys if key in WHY)
             if outcome == "cannot be":
                 bound = show.show(proven[quantity]).in_words
-                why = f"{GIVEN[where]} it is at least {bound}, whoever drives (proven for exact impacts)"
+                why = f"{PROOF_ASSUMPTIONS[where]} it is at least {bound}, whoever drives (proven for exact impacts)"
             elif why == OWN_TRAINING:
                 outcome = "undecided"
             elif outcome != "differs" or (why == REJECTS and not_ours):
@@ -147,7 +146,7 @@ def process_sheet(settings: ReproductionSettings, reading: Reading, episodes: in
 
     The list has this table, or is empty if there are no such trainings.
     """
-    outcomes = of_the_process(reading, episodes, settings)
+    outcomes = process_outcomes(reading, episodes, settings)
     if not outcomes:
         return []
     mapped = strategies(reading._replace(step_s=MAP_STEP_S), episodes, {})
@@ -251,7 +250,7 @@ def reproduce_random_table(settings: ReproductionSettings) -> Made:
         conclusions(outcomes, policies).items(), conclusions(nearest_outcomes, policies).values(), strict=True
     ):
         claims.append(judge("Table III", text, parts, nearest_parts, why=whys.get(text.partition(":")[0], "")))
-    process = of_the_process(STATED, episodes, settings)
+    process = process_outcomes(STATED, episodes, settings)
     if process:
         for text, pair in {
             "contribution 1 (less harm, fewer collisions), by the paper's process in its map": ("{}", E_V2X_BM),
@@ -264,7 +263,7 @@ def reproduce_random_table(settings: ReproductionSettings) -> Made:
 
 def reproduce_hybrid_table(settings: ReproductionSettings) -> Made:
     """Table II (``Table:hybrid``): verdicts on its numbers and conclusions, with our policy that has not converged."""
-    episodes, spec = min(STOPPED_WORLDS, settings.episodes), unconverged(settings.folder)
+    episodes, spec = min(STOPPED_WORLDS, settings.episodes), unconverged_policy(settings.folder)
     least = proven_least_harm(STATED, episodes)
 
     def rows(reading: Reading) -> ReportedRows:

@@ -21,7 +21,7 @@ import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-from ethbrake_marl.evaluation.statistics import difference, mean, unpaired
+from ethbrake_marl.evaluation.statistics import difference, mean, unpaired_difference
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.motion.layout import Floats
 
@@ -81,7 +81,7 @@ class Less(NamedTuple):
 
     @classmethod
     def of_lists(cls, where: str, smaller: Floats, larger: Floats) -> Less:
-        return cls(where, unpaired(mean(smaller), mean(larger)))
+        return cls(where, unpaired_difference(mean(smaller), mean(larger)))
 
     @classmethod
     def of_worlds(cls, where: str, smaller: Floats, larger: Floats) -> Less:

@@ -31,7 +31,7 @@ DEAF = BASE.replace(
 def lines_at(
     scenario: eb.Scenario, n: int = 20, steps: int = 0, action: float = 0.0
 ) -> tuple[MedianLine, State, State]:
-    """Return the median line before any message, the true states after some steps, and the median lines then."""
+    """Median line before any message, the true states after some steps, and the median lines then."""
     loaded, game = eb.open_game(scenario)
     line, alert = MedianLine.of(loaded, 2), loaded.sample(n, 7)
     state = game.reset(alert)
@@ -201,7 +201,7 @@ CHANNELS = {
 
 
 def decided(spec: str, scenario: eb.Scenario, alert: State) -> tuple[Any, Any]:
-    """Return Vehicle 2's commands at its first four decisions, and whether it has received or felt Vehicle 3."""
+    """Vehicle 2's commands at its first four decisions, and whether it has received or felt Vehicle 3."""
     _, game = eb.open_game(scenario)
     team, commands, aware = eb.make_agent(spec, scenario=scenario), [], []
     team = team if isinstance(team, eb.Team) else eb.Team(spec, {2: team})

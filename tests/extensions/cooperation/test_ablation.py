@@ -84,14 +84,14 @@ def test_optimum__of_a_level_counts_what_fewer_learners_do_and_what_teams_did() 
     assert can_imitate(both, two).all() and not can_imitate(two, both).any()
     alone, together = (least_known(both, each, "first") for each in ([both], [two, both]))
     assert (together <= alone).all() and (together <= two.searched.harm["first"] + 1e-9).all()
-    both.driven["first"].append(np.array([0.0, *together[1:]]))
+    both.team_harm["first"].append(np.array([0.0, *together[1:]]))
     assert least_known(both, [two, both], "first")[0] == 0.0
     assert least_known(both, [two, both], "total")[0] == pytest.approx(least_known(both, [two], "total")[0])
 
 
 def test_optimum__of_a_level_with_an_obstacle_is_simulated_with_it() -> None:
     free, ahead = answer("cooperation-3-pair", 300), answer("cooperation-3-pair", 1, obstacle_gap_m=30.0)
-    free.driven["first"].append(np.zeros(6))  # without the obstacle, so it must not count
+    free.team_harm["first"].append(np.zeros(6))  # without the obstacle, so it must not count
     assert (free.worlds.line[:, GAP, 0] >= FAR_M).all() and can_imitate(ahead, free).all()
     assert not can_imitate(free, ahead).any()
     assert (least_known(ahead, [free], "first") > 1.0).all()

@@ -177,7 +177,7 @@ class FakeGraph:
     """Repeats what was recorded, as a CUDA graph does: on the same tensors."""
 
     def replay(self) -> None:
-        self.own.result.copy_(self.own.function(*self.own.given))
+        self.own.result.copy_(self.own.function(*self.own.inputs))
 
 
 def test_graphed__replays_with_new_arguments(monkeypatch: pytest.MonkeyPatch) -> None:

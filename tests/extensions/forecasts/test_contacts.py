@@ -27,7 +27,7 @@ def seen(state: State, body: int, step_s: float = 0.1, view: View = CONTACT) -> 
 
 
 def happens(state: State, body: int, own: Any, others: Any, step_s: float) -> dict[str, np.ndarray]:
-    """Return the same from the impacts of lines that are driven so for the time of a forecast."""
+    """The same features, from the impacts of lines that follow these commands for the time of a forecast."""
     commands = np.array(others, float, copy=True)
     commands[:, body - 1] = own
     before = state.line.copy()

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.learners.start import widened
+from ethbrake_marl.extensions.learners.start import widen
 from ethbrake_marl.extensions.learners.vine import TrialResults, trusted_targets
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.recipe import load_recipe
@@ -80,6 +80,6 @@ def test_training__for_the_honest_count_selects_by_it(tmp_path: Path) -> None:
 
 def test_wider_policy__keeps_the_weights_of_its_features_in_their_new_places() -> None:
     policy = load_shipped("ppo")
-    first = widened(policy, ["contact.brake_total_harm", *reversed(policy.observation.names)])["policy.0.weight"]
+    first = widen(policy, ["contact.brake_total_harm", *reversed(policy.observation.names)])["policy.0.weight"]
     assert not first[:, 0].any()
     np.testing.assert_array_equal(first[:, 1:], policy.tensors["policy.0.weight"][:, ::-1])

@@ -39,7 +39,7 @@ def new_model(recipe: Any, scenario: Any = PAPER) -> Any:
 
 
 def fingerprint(policies: Any) -> list[float]:
-    """Return the sum of the absolute weights of each learned tensor of the first policy."""
+    """Sum of the absolute weights of each learned tensor of the first policy."""
     tensors = next(iter(policies.values())).tensors
     learned = sorted(name for name in tensors if "log_std" not in name)
     return [float(np.abs(tensors[name].astype(np.float64)).sum()) for name in learned]

@@ -81,7 +81,7 @@ def test_each_vehicle_tells_something_else() -> None:
     assert [*intents, seen_by(game, state, 1)["rear_1.intent"]] == pytest.approx([0.0, -0.35, 0.3, 0.0])
 
 
-def test_believed__is_nan_where_nothing_is_known() -> None:
+def test_belief__is_nan_where_nothing_is_known() -> None:
     tells = {"vehicle_1": ["speed", "mass"], "vehicle_2": [*PIECES], "vehicle_3": []}
     game, state = played({"tells": tells})
     state = stepped(game, state, -1.0)  # at 0.6 s: Vehicle 1 has 16.4 m/s, Vehicle 2 17.3

@@ -112,7 +112,7 @@ def test_infos__tell_when_news_counts_and_how_old_it_is() -> None:
     *_, infos = env.step({"vehicle_2": np.array([-1.0], np.float32)})
     assert infos["vehicle_2"]["age_s_vehicle_1"] == pytest.approx(0.2)
     _, game = open_game(LINE.replace(v2x={"tells": ["place"]}))
-    assert set(game.own_infos(game.reset(game.draw(1, 7, 0)))) == set(names[:3])
+    assert set(game.extra_infos(game.reset(game.draw(1, 7, 0)))) == set(names[:3])
 
 
 def test_usual_contents__written_out_change_no_bit_of_an_observation() -> None:
@@ -129,4 +129,4 @@ def test_usual_contents__written_out_change_no_bit_of_an_observation() -> None:
 def test_without_messages__there_is_no_memory_and_no_layer() -> None:
     game, state = played("nominal")
     assert game.layers == () and played(PERIODIC)[0].layers == (MESSAGES_LAYER,)
-    assert MESSAGES_KEY not in stepped(game, state, 0.0).memories and game.own_infos(state) == {}
+    assert MESSAGES_KEY not in stepped(game, state, 0.0).memories and game.extra_infos(state) == {}

@@ -138,4 +138,4 @@ def test_layers__compose_in_the_order_of_their_stages_each_with_its_memory(
     for layer in game.layers:
         if isinstance(layer, Faster):
             assert state.memories[layer.name].tolist() == [3.0, 3.0]
-            assert game.own_infos(state)[layer.name].tolist() == [3.0, 3.0]
+            assert game.extra_infos(state)[layer.name].tolist() == [3.0, 3.0]

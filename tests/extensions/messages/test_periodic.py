@@ -78,7 +78,7 @@ def test_intent__is_as_old_as_the_message() -> None:
     assert intents == pytest.approx([0, 0, 0, -0.07, -0.07, -0.21, -0.21])
 
 
-def test_believed__knows_of_no_impact_between_others() -> None:
+def test_belief__knows_of_no_impact_between_others() -> None:
     # Vehicle 2 coasts into Vehicle 1. Vehicle 3 has older news, and moves both on as if they had not met.
     game, state = played(EVERY_SECOND, scenario=LINE.replace(gaps_m=[2, 30]))
     while not state.pair_hit[0, 0]:

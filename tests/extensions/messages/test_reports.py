@@ -77,7 +77,7 @@ def test_old_message__keeps_its_error_until_the_next() -> None:
     state, errors, ages = game.reset(game.draw(1, 7, 0)), [], []
     for _ in range(20):
         errors.append(float(game.seen(state, 2).speeds_mps[0, 0]) - 20.0)
-        ages.append(float(game.own_infos(state)["age_s_vehicle_1"][0, 1]))
+        ages.append(float(game.extra_infos(state)["age_s_vehicle_1"][0, 1]))
         state = stepped(game, state, 0.0)
     news = [later < earlier for earlier, later in pairwise(ages)]
     assert any(news) and not all(news)

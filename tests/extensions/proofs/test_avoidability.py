@@ -116,7 +116,7 @@ def test_verdicts__of_shipped_lists(name):
 
 
 def impacts_of_witnesses(state, verdict, body=2):
-    """Return how many impacts the witnesses of the avoidable worlds have in the physics."""
+    """How many impacts the witnesses of the avoidable worlds have in the physics."""
     good = verdict.avoidable
     return play(state.take(good), body, verdict.switch_s[good], verdict.command_mps2[good]).line[:, IMPACTS].sum()
 
@@ -131,7 +131,7 @@ def test_witness__has_no_impact_in_the_physics(vehicles, body):
 
 
 def apart(state):
-    """Return the worlds in which no vehicles touch at equal speeds: these may lean on each other without impact."""
+    """Worlds in which no vehicles touch at equal speeds: these may lean on each other without impact."""
     return state.take(np.all((state.gaps_m > 0) | (np.diff(state.speeds_mps, axis=1) != 0), axis=1))
 
 
@@ -206,7 +206,7 @@ def test_later_states__give_the_same_verdict_and_a_witness_from_there():
 
 
 def changed(array, row, body, value):
-    """Return three worlds, of which only the second has another value."""
+    """Three worlds, of which only the second has another value."""
     state = worlds([9, 9], [9, 9, 9], 5, [0, 0.5, 0.8]).take([0, 0, 0])
     getattr(state, array)[1, row, body] = value
     return state

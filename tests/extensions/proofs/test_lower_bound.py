@@ -154,7 +154,7 @@ def at(**given):
 
 
 def random_rows(n, seed):
-    """Return rows in which Vehicle 2 brakes at least as hard as the others."""
+    """Rows in which Vehicle 2 brakes at least as hard as the others."""
     rng, drawn = np.random.default_rng(seed), {}
     for names, low, high in (
         (("GAP_L", "GAP_R"), 1, 20), (("V_L", "V_F", "V_R"), 0, 32), (("A_L", "A_R", "U_F"), 2, 8),

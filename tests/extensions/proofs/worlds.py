@@ -14,7 +14,7 @@ from tests.motion.lines import lines
 
 
 def worlds(gaps: Any, speeds: Any, braking: Any, latency: Any = 0.0, **settings: Any) -> State:
-    """Return n worlds at the alert; ``drive``, ``mass``, ``limit``, ``restitution``, ``obstacle`` as given."""
+    """Worlds at the alert, [n]; ``drive``, ``mass``, ``limit``, ``restitution``, ``obstacle`` as given."""
     rows = {"drive": 0.0, "mass": 5.0, "limit": 40.0, "restitution": 0.1, "obstacle": FAR_M} | settings
     line, car = lines(
         gaps, speeds, restitution=rows["restitution"], obstacle_gap_m=rows["obstacle"], mass_t=rows["mass"],
@@ -30,12 +30,12 @@ def paper_line(gaps: Any, speeds: Any, latency: Any) -> State:
 
 
 def opening(gap: float) -> State:
-    """Return a world in which Vehicle 1 drives away from one that is 4 m/s faster and brakes less."""
+    """World in which Vehicle 1 drives away from one that is 4 m/s faster and brakes less."""
     return worlds(gap, [10, 14], [5, 2], drive=[2, 0])
 
 
 def wide_worlds(n: int, N: int, seed: int) -> State:
-    """Return lines with any capacities, masses and restitution, low limits, slow and touching ones, exact zeros."""
+    """Lines with any capacities, masses and restitution, low limits, slow and touching ones, exact zeros."""
     rng = np.random.default_rng(seed)
     gaps = rng.uniform(0, 40, (n, N - 1)) * rng.choice([0.1, 0.4, 1.0], (n, N - 1))
     speeds = rng.uniform(0, 35, (n, 1)) + rng.normal(0, 1, (n, N)) * rng.choice([0.5, 3, 10], (n, 1))
@@ -76,7 +76,7 @@ def play(state: State, body: int, switch_s: Floats, command_mps2: Floats) -> Sta
 
 
 def random_commands(state: State, body: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return switch times and commands [n, 5]: most commands extreme, most switches soon after the latency."""
+    """Switch times and commands [n, 5]: most commands extreme, most switches soon after the latency."""
     n, low, high = state.n, -state.braking_capacity_mps2[:, [body - 1]], state.driving_capacity_mps2[:, [body - 1]]
     span = np.max(state.latency_s + state.speeds_mps / state.braking_capacity_mps2, axis=1, keepdims=True)
     part = np.sort(rng.uniform(0, 1, (n, 4)) ** rng.choice([1, 2, 4], (n, 1)), axis=1)
@@ -87,7 +87,7 @@ def random_commands(state: State, body: int, rng: np.random.Generator) -> tuple[
 
 
 def searched_harm(state: State, rounds: int, seed: int) -> dict[str, Floats]:
-    """Return the least harm of random commands of Vehicle 2, and of changes to the best of them, in both counts."""
+    """Least harm of random commands of Vehicle 2, and of changes to the best of them, in both counts."""
     rng = np.random.default_rng(seed)
     switch, command = random_commands(state, 2, rng)
     least = {count: np.full(state.n, np.inf) for count in ("first", "total")}

@@ -23,7 +23,7 @@ def compared_by(scenario: str | eb.Scenario, agents: object, episodes: int = 60,
 
 
 def with_best_known(compared: Compared) -> Compared:
-    """Return the result with invented best known harm: half of these agents' least harm; avoidable where that is 0."""
+    """Result with invented best known harm: half of these agents' least harm; avoidable where that is 0."""
     result = compared.result
     least = {
         count: 0.5 * np.min([own[harm] for own in result.columns.values()], axis=0) for count, harm in HARM.items()

@@ -11,7 +11,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import _EXTRA_OF
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, is_papers_test, printed_sheet
-from ethbrake_marl.extensions.report.run import learners_sheets, telling_row
+from ethbrake_marl.extensions.report.run import learners_sheets, typical_row_of
 from ethbrake_marl.extensions.report.three_tests import TESTS, is_as_shipped, other_tests, short_sheet
 from ethbrake_marl.training.experiment import run_experiment
 from tests.cli.test_run import ctrl_c_when, status_of
@@ -104,9 +104,9 @@ def test_several_learners__who_bears_what_and_what_each_adds(tmp_path: Path) -> 
         ([0.0, 0.0], [0.0, 5.0], 0),  # full braking harms nobody
     ],
 )
-def test_telling_row__is_the_median_saving_among_harmful_worlds(before: Any, after: Any, row: int) -> None:
+def test_typical_row__is_the_median_saving_among_harmful_worlds(before: Any, after: Any, row: int) -> None:
     result = {"full_brake": {"total_harm": np.array(before)}, "mine": {"total_harm": np.array(after)}}
-    assert telling_row(Compared(None, {}, result, None, "total"), "mine") == row  # type: ignore[arg-type]
+    assert typical_row_of(Compared(None, {}, result, None, "total"), "mine") == row  # type: ignore[arg-type]
 
 
 def test_three_tests__are_each_others_and_of_the_shipped_scenarios_only() -> None:

@@ -129,7 +129,7 @@ def test_trainings__stop_and_continue(tiny: ReproductionSettings) -> None:
         learning.train_groups(replace(tiny, tell=stop), [STOPPED])
     assert learning.finished_runs(tiny.folder, STOPPED) == {} and learning.seconds_left(tiny.folder, [STOPPED]) == 6.0
     assert learning.train_groups(tiny, [STOPPED]) and learning.seconds_left(tiny.folder, [STOPPED]) == 0.0
-    agent = eb.make_agent(learning.unconverged(tiny.folder), scenario="paper-random")
+    agent = eb.make_agent(learning.unconverged_policy(tiny.folder), scenario="paper-random")
     assert agent.policy.manifest.steps == 512
 
 

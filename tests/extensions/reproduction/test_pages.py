@@ -41,7 +41,7 @@ def claims_of(page: str) -> list[str]:
 def test_results__have_every_claim_that_the_code_makes_and_no_other(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(strategies, "process", lambda settings: {name: [spec] for name, spec in SHIPPED_SPECS.items()})
     for module in (curves, tables):
-        monkeypatch.setattr(module, "unconverged", lambda folder: "ppo-obstacle")
+        monkeypatch.setattr(module, "unconverged_policy", lambda folder: "ppo-obstacle")
     settings = ReproductionSettings(tmp_path, episodes=20)
     made = [claim for item in ITEMS for claim in item.make(settings).claims]
     committed = [re.split(r" ?\| ?", row)[1:3] for row in claims_of(RESULTS)]

@@ -130,7 +130,7 @@ def by_text(made: Made) -> dict[str, tuple[str, str, Verdict]]:
 @pytest.fixture
 def ppo_is_unconverged(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (curves, tables):
-        monkeypatch.setattr(module, "unconverged", lambda folder: "ppo-obstacle")
+        monkeypatch.setattr(module, "unconverged_policy", lambda folder: "ppo-obstacle")
 
 
 @pytest.fixture
@@ -209,7 +209,7 @@ def test_distance__figure_and_tables_have_the_same_numbers() -> None:
 
 @pytest.mark.parametrize(("spec", "outcome"), [("ppo-obstacle", "differs"), ("e_v2x_bm:pairwise", "agrees")])
 def test_illustration__counts_the_worlds_in_which_the_hybrid_is_not_the_better(monkeypatch, spec, outcome) -> None:
-    monkeypatch.setattr(curves, "unconverged", lambda folder: spec)
+    monkeypatch.setattr(curves, "unconverged_policy", lambda folder: spec)
     (claim,) = curves.reproduce_illustration(SETTINGS).claims
     agents = [spec, f"{spec}+episode:pairwise", "e_v2x_bm:pairwise"]
     result = eb.evaluate(DISTANCE, [*dict.fromkeys(agents)], episodes=100)

@@ -43,7 +43,7 @@ def test_best_harm__of_no_table_is_never_worse_than_its_start_or_e_v2x_bm(count:
 
 
 @pytest.mark.parametrize(("inside", "count"), [("constant:5", "first"), ("ppo", "total"), ("ppo", "honest")])
-def test_searched__is_never_worse_and_better_with_more_candidates(inside: str, count: str) -> None:
+def test_search_around__is_never_worse_and_better_with_more_candidates(inside: str, count: str) -> None:
     agent, column = eb.make_agent(inside, scenario=PAPER), COLUMN[count]
     agents = {"plain": agent, **{str(n): SearchAround(agent, PAPER, count, n) for n in (20, 200)}}
     result = eb.evaluate("paper-random", agents, episodes=30, seed=3, harm_count=count)

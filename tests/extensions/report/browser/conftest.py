@@ -18,7 +18,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Return one browser for all tests of a module.
+    """One browser for all tests of a module.
 
     While it is open, its event loop runs, so tests of other modules have their own.
     """
@@ -34,7 +34,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
-    """Return a function that opens an address.
+    """Function that opens an address.
 
     At the end of the test, the console must be empty, and no other address may have been requested.
     """
