@@ -13,7 +13,7 @@ from ethbrake_marl.episode.commands import proposal_array
 from ethbrake_marl.episode.layer import Layer, agent_through, script_through, view_through
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
-from ethbrake_marl.episode.script_calls import ask_script, begin_script
+from ethbrake_marl.episode.script_calls import ask_scripts, begin_script
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import Step, StepSettings
 from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
@@ -139,13 +139,9 @@ class Game(NamedTuple):
 
     def reset(self, alert: State) -> State:
         """Episodes at their first decision, from worlds at the alert. Scripts decide at the alert."""
-        wanted, memories = alert.wanted, dict(alert.memories)
-        if self.scripts:
-            wanted = wanted.copy()
-            for body, script in self.scripts.items():
-                memory = begin_script(script, alert, body)
-                wanted[:, body], memories[body] = ask_script(script, alert, memory, body)
-        state = self.first_decision(alert._replace(wanted=wanted, memories=memories))
+        script_memories = {body: begin_script(script, alert, body) for body, script in self.scripts.items()}
+        decided = ask_scripts(self.scripts, alert._replace(memories={**alert.memories, **script_memories}))
+        state = self.first_decision(decided)
         memories = dict(state.memories)
         if self.rewarding.shaping is not None:
             memories["shaping"] = self.rewarding.shaping.begin(state)
