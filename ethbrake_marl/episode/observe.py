@@ -89,10 +89,6 @@ class View:
     def __repr__(self) -> str:
         return f"View({list(self.names)})"
 
-    def part(self, names: Sequence[str]) -> View:
-        """The same view of some of its features."""
-        return View(names)
-
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
         """Observations of the bodies ``observers`` (1: Vehicle 1), [n, observers, F]."""
         plan = self.plan

@@ -31,7 +31,7 @@ def test_bias__is_in_what_others_see_and_nowhere_else() -> None:
     assert (now["own.speed"], now["front_1.gap"]) == (then["own.speed"], then["front_1.gap"])
     assert state.speeds_mps.tolist() == [[20.0, 18.0, 22.0]]
     assert game.seen(state, 2).speeds_mps.tolist() == [[21.0, 18.0, 23.0]]
-    assert game.hides(state, 2).tolist() == [[False, True, False, True]]
+    assert game.layers[0].hides(state, 2).tolist() == [[False, True, False, True]]
 
 
 def test_liar__seems_neither_to_brake_nor_to_mean_it() -> None:
