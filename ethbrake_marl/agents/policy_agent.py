@@ -6,7 +6,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from ethbrake_marl.agents.foreign import (
 from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.layer import MESSAGES, Layer, view_through
+from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import NUMBER, State, map_arrays
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_whole_number
@@ -39,7 +39,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 
 @dataclass(frozen=True)
-class LearnedAgent:
+class LearnedAgent(Observer):
     """Drives with the deterministic actions of a policy of this package.
 
     >>> import ethbrake_marl as eb
@@ -50,7 +50,6 @@ class LearnedAgent:
     policy: Policy
     name: str = "learned"
     knows: str = MESSAGES
-    observation: View | None = None  # None: that of the policy
 
     def __post_init__(self) -> None:
         if not isinstance(self.policy, Policy):
@@ -78,22 +77,17 @@ class LearnedAgent:
                 stacklevel=2,
             )
 
-    def through(self, layers: tuple[Layer, ...]) -> LearnedAgent:
-        """The agent, observing the state through ``layers`` such as messages (``episode.layer``)."""
-        return replace(self, observation=view_through(layers, self.observation or self.policy.observation))
-
     def begin(self, alert: State, body: int) -> None:
         """None, because the agent has no memory."""
 
     def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
-        policy = self.policy
-        view = self.observation or policy.observation
-        observations = view.observe(state, np.array([body]), policy.manifest.time_step_s)[:, 0]
+        policy, step_s = self.policy, self.policy.manifest.time_step_s
+        observations = observe_through(self.layers, policy.observation, state, body, step_s)
         return commands_of(state, body, policy(observations)[:, 0].astype(np.float64)), None
 
 
 @dataclass(frozen=True)
-class PolicyAgent:
+class PolicyAgent(Observer):
     """Drives with a policy of another library; made by ``policy_agent``. It can be pickled if the policy can."""
 
     policy: Any
@@ -116,10 +110,6 @@ class PolicyAgent:
                 " for the scenario of its training"
             )
 
-    def through(self, layers: tuple[Layer, ...]) -> PolicyAgent:
-        """The agent, observing the state through ``layers`` such as messages (``episode.layer``)."""
-        return replace(self, observation=view_through(layers, self.observation))
-
     def begin(self, alert: State, body: int) -> Any:
         return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)
 
@@ -128,7 +118,7 @@ class PolicyAgent:
 
         Raises ``AgentFailed`` for actions of a wrong shape or outside their range.
         """
-        observations = self.observation.observe(state, np.array([body]), self.time_step_s)[:, 0]
+        observations = observe_through(self.layers, self.observation, state, body, self.time_step_s)
         if self.initial_state is None:
             answer = self.ask(self.policy, observations)
         else:

@@ -73,10 +73,7 @@ def action_array(learners: Ints, actions: Floats | None, n: int) -> Floats:
 def proposal_array(learners: Ints, actions: Floats | None, n: int) -> Floats:
     """Copy of proposed actions, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput`` for a bad type, shape or action."""
     actions = action_array(learners, actions, n)
-    size = np.abs(actions)
-    if not (size > 1.0).any():
-        return actions.copy()
-    for row in actions[(size > LARGEST_ACTION).any(axis=1)]:
+    for row in actions[(np.abs(actions) > LARGEST_ACTION).any(axis=1)]:
         check_actions(learners, np.where(np.isnan(row), 0.0, row))
     return np.clip(actions, -1.0, 1.0)
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.commands import proposal_array
-from ethbrake_marl.episode.layer import Layer, agent_through, script_through, view_through
+from ethbrake_marl.episode.layer import Layer, agent_through, observe_through, script_through
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
-from ethbrake_marl.episode.script_calls import ask_script, begin_script
+from ethbrake_marl.episode.script_calls import ask_scripts, begin_script
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import Step, StepSettings
-from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
+from ethbrake_marl.motion.layout import Floats, Ints
 
 
 class Script(Protocol):
@@ -136,19 +136,14 @@ class Game(NamedTuple):
     def with_layers(self, layers: Sequence[Layer]) -> Game:
         """The same game with ``layers`` between the true state and its views and scripts; it has none yet."""
         layers = tuple(layers)
-        views = tuple(view_through(layers, view) for view in self.views)
         scripts = {body: script_through(layers, script) for body, script in self.scripts.items()}
-        return self._replace(views=views, scripts=scripts, layers=layers)
+        return self._replace(scripts=scripts, layers=layers)
 
     def reset(self, alert: State) -> State:
-        """Episodes at their first decision, from worlds at the ``alert``. Scripts already decide at the alert."""
-        wanted, memories = alert.wanted, dict(alert.memories)
-        if self.scripts:
-            wanted = wanted.copy()
-            for body, script in self.scripts.items():
-                memory = begin_script(script, alert, body)
-                wanted[:, body], memories[body] = ask_script(script, alert, memory, body)
-        state = self.first_decision(alert._replace(wanted=wanted, memories=memories))
+        """Episodes at their first decision, from worlds at the alert. Scripts decide at the alert."""
+        script_memories = {body: begin_script(script, alert, body) for body, script in self.scripts.items()}
+        decided = ask_scripts(self.scripts, alert._replace(memories={**alert.memories, **script_memories}))
+        state = self.first_decision(decided)
         memories = dict(state.memories)
         if self.rewarding.shaping is not None:
             memories["shaping"] = self.rewarding.shaping.begin(state)
@@ -227,26 +222,22 @@ class Game(NamedTuple):
             return drivers
         return {body: agent_through(self.layers, agent) for body, agent in drivers.items()}
 
-    def hides(self, alert: State, body: int) -> Bools:
-        """Whether vehicle ``body`` lacks information about each body at its first decision, [n, N + 1]."""
-        hidden: Bools = alert.know[:, body] > alert.car[:, LATENCY, body, np.newaxis]
-        for layer in self.layers:
-            hidden = hidden | layer.hides(alert, body)
-        return hidden
-
     def extra_infos(self, state: State) -> dict[str, Any]:
         """Infos of this game's shield and layers: name -> [n] or [n, N]."""
-        values = {} if self.shield is None else self.shield.infos(self, state)
-        infos = {f"shield_{name}": value for name, value in values.items()}
+        shield_infos = {} if self.shield is None else self.shield.infos(self, state)
+        infos = {f"shield_{name}": value for name, value in shield_infos.items()}
         for layer in self.layers:
             infos |= layer.infos(state)
         return infos
 
     def observe(self, state: State, bodies: Ints) -> list[Observations]:
         """Observations of each body: a list of arrays [n, F], with the F features that this body observes."""
-        return [self.views[i].observe(state, np.array([i]), self.settings.time_step_s)[:, 0] for i in bodies.tolist()]
+        step_s = self.settings.time_step_s
+        return [observe_through(self.layers, self.views[i], state, i, step_s) for i in bodies.tolist()]
 
     def observe_alike(self, state: State, bodies: Sequence[int] | Ints) -> Observations:
         """Observations of ``bodies`` that all observe the same F features, [n, len(bodies), F]."""
         bodies = np.asarray(bodies, np.int64)
+        if self.layers:
+            return np.stack(self.observe(state, bodies), axis=1)
         return self.views[bodies[0]].observe(state, bodies, self.settings.time_step_s)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.script_calls import UserScript, name_of
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.motion.layout import Bools, Floats, Ints
+from ethbrake_marl.motion.layout import Bools, Floats
 
 if TYPE_CHECKING:
     from ethbrake_marl.episode.game import Game
@@ -69,31 +68,15 @@ class Layer:
         """Values that this layer adds to the infos: name -> [n] or [n, N]."""
         return {}
 
-    def view(self, view: View) -> View:
-        """A view with the features of ``view``, computed from the state that this layer lets through."""
-        return LayeredView(self, view)
+    def observe(
+        self, later: tuple[Layer, ...], view: View, state: State, body: int, time_step_s: float
+    ) -> Observations:
+        """Observations of vehicle ``body`` through this layer and the ``later`` ones, [n, F]."""
+        return observe_through(later, view, self.seen(state, body), body, time_step_s)
 
     def script(self, script: Any) -> Any:
         """A script that acts like ``script`` on the state that this layer lets through to its vehicle."""
         return LayeredScript(self, script)
-
-
-class LayeredView(View):
-    """A view of the state that a layer lets through."""
-
-    def __init__(self, layer: Layer, view: View) -> None:
-        super().__init__(view.names)
-        self.layer, self.inner = layer, view
-
-    def part(self, names: Sequence[str]) -> View:
-        return type(self)(self.layer, self.inner.part(names))
-
-    def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
-        columns = [
-            self.inner.observe(self.layer.seen(state, body), np.array([body]), time_step_s)
-            for body in observers.tolist()
-        ]
-        return np.concatenate(columns, axis=1)
 
 
 class LayeredScript:
@@ -111,12 +94,18 @@ class LayeredScript:
         return answer
 
 
-@cache
-def view_through(layers: tuple[Layer, ...], view: View) -> View:
-    """``view`` of the state that all layers let through; the first layer is nearest to the true state."""
-    for layer in reversed(layers):
-        view = layer.view(view)
-    return view
+@dataclass(frozen=True, kw_only=True)
+class Observer:
+    """Base class of agents that act on the observations of a view, and observe through ``layers`` themselves."""
+
+    layers: tuple[Layer, ...] = ()
+
+
+def observe_through(layers: tuple[Layer, ...], view: View, state: State, body: int, time_step_s: float) -> Observations:
+    """Observations of vehicle ``body``, [n, F]. The first layer is the nearest to the true ``state``."""
+    if not layers:
+        return view.observe(state, np.array([body]), time_step_s)[:, 0]
+    return layers[0].observe(layers[1:], view, state, body, time_step_s)
 
 
 def script_through(layers: tuple[Layer, ...], script: Any) -> Any:
@@ -129,6 +118,6 @@ def agent_through(layers: tuple[Layer, ...], agent: Any) -> Any:
     """The agent behind all layers, if it uses only sensors and messages; any other agent still sees the true state."""
     if isinstance(agent, UserScript):
         return UserScript(agent_through(layers, agent.script))
-    if hasattr(agent, "through"):  # it observes by a view
-        return agent.through(layers)
+    if isinstance(agent, Observer):
+        return replace(agent, layers=layers)
     return script_through(layers, agent) if getattr(agent, "knows", None) in (SENSORS, MESSAGES) else agent

@@ -91,10 +91,6 @@ class View:
     def __repr__(self) -> str:
         return f"View({list(self.names)})"
 
-    def part(self, names: Sequence[str]) -> View:
-        """A view of only the features ``names``."""
-        return View(names)
-
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
         """Observations of the bodies ``observers`` (1: Vehicle 1), [n, len(observers), F]; this view has F features."""
         plan = self.plan

@@ -95,13 +95,12 @@ def ask_script(script: Any, state: State, memory: Any, body: int) -> tuple[Float
 
 
 def ask_scripts(scripts: Mapping[int, Any], state: State) -> State:
-    """State with new commands and new memories of the ``scripts``. The array of commands is a new one."""
-    wanted, memories, commands = state.wanted.copy(), dict(state.memories), {}
-    for i, script in scripts.items():
-        commands[i], memories[i] = ask_script(script, state, memories[i], i)
+    """State with new commands and memories of the ``scripts``; its commands are a new array."""
+    wanted, memories = state.wanted.copy(), dict(state.memories)
     running = ~state.ended  # nothing changes in an episode that has ended
-    for i, command_mps2 in commands.items():
-        np.copyto(wanted[:, i], command_mps2, where=running)
+    for i, script in scripts.items():
+        commands, memories[i] = ask_script(script, state, memories[i], i)
+        np.copyto(wanted[:, i], commands, where=running)
     return state._replace(wanted=wanted, memories=memories)
 
 

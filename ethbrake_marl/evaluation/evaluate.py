@@ -239,7 +239,10 @@ def hidden_from(alert: State, game: Game) -> Bools:
     """
     late, hidden = alert.car[:, LATENCY] > alert.car[:, OWN_LATENCY], np.zeros(alert.n, np.bool_)
     for i in game.settings.learners.tolist():
-        hidden |= np.delete(game.hides(alert, i) | late, [0, i], axis=1).any(axis=1)
+        unknown = alert.know[:, i] > alert.car[:, LATENCY, i, np.newaxis]
+        for layer in game.layers:
+            unknown |= layer.hides(alert, i)
+        hidden |= np.delete(unknown | late, [0, i], axis=1).any(axis=1)
     return hidden
 
 

@@ -51,8 +51,7 @@ class PushedAway:
         """Add the distance that Vehicle 1 travels in this step, which is simulated again (``with_post``)."""
         line = with_post(before)
         from_m = line[:, GAP, 0].copy()
-        times = np.ascontiguousarray(before.time_s), np.ascontiguousarray(after.time_s)
-        advance_worlds(line, before.car, *times, after.wanted, scratch_for(line.shape[2]))
+        advance_worlds(line, before.car, before.time_s, after.time_s, after.wanted, scratch_for(line.shape[2]))
         self.way_m += from_m - line[:, GAP, 0]
 
     def result(self, last: State) -> MeasureValue:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, NoReturn, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput
@@ -46,6 +47,11 @@ class FileModel(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
+    @classmethod
+    def key_fields(cls) -> Mapping[str, FieldInfo]:
+        """Field of each valid key, for error messages."""
+        return cls.model_fields
+
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -70,16 +76,17 @@ def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
 class Wording:
     """Parts of error messages for one kind of file, which subclasses override. An empty text is left out."""
 
-    def __init__(self, model: type[BaseModel], needed: str = "") -> None:
+    def __init__(self, model: type[FileModel], needed: str = "") -> None:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
         """Keys that would be valid in place of the last key of ``path``."""
         models = [self.model]
         for key in path[:-1]:
-            inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
+            fields = [model.key_fields().get(str(key)) for model in models]
+            inside = [field.annotation for field in fields if field is not None]
             models = [nested_model for annotation in inside for nested_model in _models_in(annotation)] or models
-        return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
+        return list(dict.fromkeys(f.alias or name for model in models for name, f in model.key_fields().items()))
 
     def needed(self, path: YamlPath) -> str:
         """Advice about the missing key at ``path``."""
@@ -108,8 +115,8 @@ def explain(document: Document, error: ValidationError, wording: Wording) -> Inv
     return InvalidInput(f"{document.file if absent else document.where(path)}: {_describe(detail, path, wording)}")
 
 
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+def _models_in(annotation: Any) -> Iterator[type[FileModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, FileModel):
         yield annotation
     for inner in get_args(annotation):
         yield from _models_in(inner)

@@ -17,6 +17,7 @@ from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.agents.team import MODEL, Agent, propose
 from ethbrake_marl.episode.commands import actions_of
+from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.script_calls import begin_script
@@ -25,7 +26,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import constant_plans, rollout
-from ethbrake_marl.shields.shield import NamedShield, check_drivers, check_harm_count, checked_drivers, spread
+from ethbrake_marl.shields.shield import NamedShield, check_drivers, checked_drivers, spread
 
 ACTION_ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the applied action
 
@@ -56,7 +57,7 @@ class EpisodeShield:
     def __init__(
         self, drivers: Mapping[int, Agent] | None, *, harm_count: str = "first", bound: str = "coupled"
     ) -> None:
-        check_harm_count(harm_count)
+        check_count("shield: harm_count", harm_count)
         if bound not in ("coupled", "pairwise"):
             raise InvalidInput(f"shield: bound = {bound!r}: must be 'coupled' or 'pairwise'")
         self.drivers, self.count, self.coupled = checked_drivers(drivers), harm_count, bound == "coupled"

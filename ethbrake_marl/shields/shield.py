@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.team import Agent, Team, check_agent
-from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game, Shield
 from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.episode.state import State
@@ -84,10 +83,6 @@ def check_drivers(game: Game, drivers: Mapping[int, Agent]) -> None:
     if list(drivers) != game.settings.learners.tolist():
         names, right = (", ".join(f"vehicle_{i}" for i in bodies) for bodies in (drivers, game.settings.learners))
         raise InvalidInput(f"shield: has agents for {names}; must have one for each learner, {right or 'none'}")
-
-
-def check_harm_count(count: str) -> None:
-    check_count("shield: harm_count", count)
 
 
 def spread(game: Game, state: State, columns: Any, script_value: Any = 0) -> Any:

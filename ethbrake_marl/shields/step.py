@@ -38,6 +38,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.team import MODEL, Agent, propose
+from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import follow_plans
 from ethbrake_marl.episode.script_calls import begin_script
@@ -46,14 +47,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
-from ethbrake_marl.shields.shield import (
-    NamedShield,
-    ShieldReason,
-    check_drivers,
-    check_harm_count,
-    checked_drivers,
-    spread,
-)
+from ethbrake_marl.shields.shield import NamedShield, ShieldReason, check_drivers, checked_drivers, spread
 
 NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
 
@@ -110,7 +104,7 @@ class StepShield:
         allowance: float = 0.0,
         cap: str | None = None,
     ) -> None:
-        check_harm_count(harm_count)
+        check_count("shield: harm_count", harm_count)
         if isinstance(allowance, bool) or not isinstance(allowance, int | float) or not 0.0 <= allowance < np.inf:
             raise InvalidInput(f"shield: allowance = {allowance!r}: must be a finite number, at least 0 m2/s2")
         if cap not in (None, "baseline"):

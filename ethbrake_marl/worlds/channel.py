@@ -36,6 +36,7 @@ from pydantic import (
     model_serializer,
     model_validator,
 )
+from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -88,19 +89,17 @@ class Extension:
 
     >>> from ethbrake_marl.episode.layer import Layer
     >>> from ethbrake_marl.worlds.channel import Extension
+    >>> from ethbrake_marl.worlds.quantity import ScenarioPart
+    >>> class FogKeys(ScenarioPart):
+    ...     fog_m: float | None = None
     >>> class Fog(Extension):
-    ...     name = "fog"
-    ...     schemas = {"fog_m": {"description": "largest gap that sensors see", "type": "number"}}
+    ...     name, keys = "fog", FogKeys
     ...     def layer(self, v2x):
     ...         return Layer()  # here one that limits the gaps to v2x.fog_m
     """
 
     name: str  # of its memory in `State.memories`
-    schemas: Mapping[str, JsonSchemaValue]  # JSON schema of each key, with a description
-
-    def read(self, key: str, value: Any) -> Any:
-        """Checked value of a key, as plain data. Refuses a bad value (``files.model.refuse``)."""
-        return value
+    keys: type[ScenarioPart]  # its keys of ``v2x``, with types and descriptions; none is required
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
         """Keys in ``OF_MESSAGES`` that have an effect with this extension. A key without any effect is refused."""
@@ -195,17 +194,22 @@ class V2X(ScenarioPart):
         require(isinstance(name, str) and name in PRESETS, place, name, right)
         written = value if isinstance(value, dict) else {"preset": value}
         known = (*cls.model_fields, *EXTENSIONS)
+        settings = dict(written)
         for key in written:
             close = suggestion(str(key), known) or f"known: {', '.join(known)}"
             require(key in known, (key,), UNSHOWN, f"unknown key; {close}")
-        settings = {
-            key: EXTENSIONS[key].read(key, setting) if key in EXTENSIONS else setting
-            for key, setting in written.items()
-        }
+            if key in EXTENSIONS:
+                part = EXTENSIONS[key].keys.model_validate({key: written[key]})
+                settings |= part.model_dump(exclude_unset=True)
         v2x = build({**PRESETS[name], **settings, "preset": name})
         v2x._keys = frozenset({"preset", *written})
         v2x._check()
         return v2x
+
+    @classmethod
+    def key_fields(cls) -> Mapping[str, FieldInfo]:
+        extensions = EXTENSIONS.usable()
+        return {**cls.model_fields, **{key: extensions[key].keys.model_fields[key] for key in extensions}}
 
     @model_serializer(mode="wrap")
     def _as_written(self, dump: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
@@ -243,11 +247,11 @@ class V2X(ScenarioPart):
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         mapping = handler(core)
-        extension_properties = {key: extension.schemas[key] for key, extension in EXTENSIONS.usable().items()}
-        by_preset = {
-            key: {k: v for k, v in schema.items() if k != "default"} for key, schema in mapping["properties"].items()
-        }
-        mapping = {**mapping, "properties": {**by_preset, **extension_properties}, "additionalProperties": False}
+        properties = dict(mapping["properties"])
+        for extension in EXTENSIONS.usable().values():
+            properties |= handler.resolve_ref_schema(handler(extension.keys.__pydantic_core_schema__))["properties"]
+        properties = {key: {k: v for k, v in schema.items() if k != "default"} for key, schema in properties.items()}
+        mapping = {**mapping, "properties": properties, "additionalProperties": False}
         return {"anyOf": [{"enum": list(PRESETS), "type": "string"}, mapping]}
 
     @property

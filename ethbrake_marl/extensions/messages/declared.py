@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from ethbrake_marl.episode.layer import Layer
 from ethbrake_marl.extensions.messages.game import MESSAGES_LAYER
@@ -18,60 +19,56 @@ from ethbrake_marl.extensions.messages.links import (
     PERIOD,
     PIECES,
     MessageMemory,
+    Piece,
     memory_at_alert,
     samples_kept,
 )
-from ethbrake_marl.files.model import UNSHOWN, require, suggestion
+from ethbrake_marl.files.model import UNSHOWN, require
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.worlds.channel import PER_LINK, V2X, Extension
 from ethbrake_marl.worlds.counters import Numbers
 from ethbrake_marl.worlds.quantities import NEWS, OF_WORLD
+from ethbrake_marl.worlds.quantity import ScenarioPart
 from ethbrake_marl.worlds.scenario import Scenario
 
 LATER_LOSSES = (5,)  # stream of the numbers that decide which messages after the first are lost
 MOST_SAMPLES = 1_000  # that a vehicle may keep for delayed messages
 DEFAULT_CONTENT = PIECES[:-1]  # what a message contains unless the scenario says otherwise
-_LISTED = {"type": "array", "items": {"enum": list(PIECES)}, "uniqueItems": True}
+
+
+def _in_order(pieces: list[Piece]) -> list[Piece]:
+    require(len(set(pieces)) == len(pieces), (), pieces, "must not list an item twice")
+    return [piece for piece in PIECES if piece in pieces]
+
+
+Contents = Annotated[
+    list[Piece], Field(strict=False, json_schema_extra={"uniqueItems": True}), AfterValidator(_in_order)
+]
+
+
+class MessageKeys(ScenarioPart):
+    persistence: Literal["first", "periodic"] | None = Field(
+        default=None,
+        description="what a receiver knows after the first message: first: always the present state of the sender;"
+        " periodic: the state in the newest message that arrived",
+    )
+    tells: (
+        Annotated[
+            Annotated[Contents, Tag("#list")] | Annotated[dict[str, Contents], Field(min_length=1), Tag("#mapping")],
+            Discriminator(lambda value: "#mapping" if isinstance(value, Mapping) else "#list"),
+        ]
+        | None
+    ) = Field(
+        default=None,
+        description="contents of messages, for all vehicles or by vehicle name: place, speed, acceleration,"
+        " braking_capacity, latency, mass, intent; by default all but intent",
+    )
 
 
 class Messages(Extension):
     """Extension that the keys ``persistence`` and ``tells`` of ``v2x`` switch on."""
 
-    name = "messages"
-    schemas: Mapping[str, dict[str, Any]] = {
-        "persistence": {
-            "description": "what a receiver knows after the first message: first: always the present state of the"
-            " sender; periodic: the state in the newest message that arrived",
-            "enum": ["first", "periodic"],
-        },
-        "tells": {
-            "description": "contents of messages, for all vehicles or by vehicle name: place, speed, acceleration,"
-            " braking_capacity, latency, mass, intent; by default all but intent",
-            "anyOf": [_LISTED, {"type": "object", "minProperties": 1, "additionalProperties": _LISTED}],
-        },
-    }
-
-    def read(self, key: str, value: Any) -> Any:
-        """Value of the key as plain data. Raises an error for any other value.
-
-        ``persistence`` is ``first`` or ``periodic``; ``tells`` a list of names in ``PIECES``, or vehicle -> list.
-        """
-        if key == "persistence":
-            require(value in ("first", "periodic"), (key,), value, "must be first or periodic")
-            return value
-        right = f"must be a list of items from {', '.join(PIECES)}, or a mapping from vehicle names to such lists"
-        by_name = isinstance(value, Mapping)
-        require(isinstance(value, list | tuple) or (by_name and len(value) > 0), (key,), value, right)
-        read = {}
-        for name, pieces in value.items() if by_name else [("", value)]:
-            at = (key, name) if by_name else (key,)
-            require(isinstance(name, str) and isinstance(pieces, list | tuple), at, pieces, right)
-            for k, piece in enumerate(pieces):
-                hint = suggestion(piece, PIECES) if isinstance(piece, str) else ""
-                require(piece in PIECES, (*at, k), piece, f"{hint}; known: {', '.join(PIECES)}".removeprefix("; "))
-            require(len(set(pieces)) == len(pieces), at, pieces, "must not list an item twice")
-            read[name] = [piece for piece in PIECES if piece in pieces]
-        return read if by_name else read[""]
+    name, keys = "messages", MessageKeys
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
         """Keys of ``v2x`` that have an effect on messages after the first. Raises an error for keys without effect."""

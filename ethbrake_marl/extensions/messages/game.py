@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.episode.features import GROUPS, side_of
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.layer import Layer, LayeredScript, LayeredView
+from ethbrake_marl.episode.layer import Layer, LayeredScript, observe_through
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.messages.belief import (
@@ -88,8 +88,22 @@ class MessagesLayer(Layer):
             infos |= {f"{name}_vehicle_{j}": values[:, 1:, j] for j in range(1, values.shape[2])}
         return infos
 
-    def view(self, view: View) -> View:
-        return BelievedView(self, view)
+    def observe(
+        self, later: tuple[Layer, ...], view: View, state: State, body: int, time_step_s: float
+    ) -> Observations:
+        """Observations of what vehicle ``body`` estimates, [n, F].
+
+        A feature is 0 if it needs a quantity that the vehicle does not know. Feature groups of other packages show a
+        vehicle only if the observer knows all of its quantities but the intent.
+        """
+        observations = np.empty((state.n, len(view.names)), np.float32)
+        known, (parts, needs) = known_pieces(state, body), _parts_and_needs(view)
+        for part, columns, belief in parts:
+            observations[:, columns] = observe_through(later, part, belief(state, body), body, time_step_s)
+        for column, offset, pieces in needs:
+            if 0 < body + offset < known.shape[1]:
+                observations[~known[:, body + offset, pieces].all(axis=1), column] = 0.0
+        return observations
 
     def script(self, script: Any) -> Any:
         return Believer(self, script)
@@ -102,39 +116,23 @@ def _with_memory(state: State, memory: MessageMemory) -> State:
     return state._replace(memories={**state.memories, MESSAGES_KEY: memory})
 
 
-class BelievedView(LayeredView):
-    """Observations of what a vehicle estimates. A feature is 0 if it needs a quantity that the vehicle does not know.
-
-    Feature groups of other packages show a vehicle only if the observer knows all of its quantities, except perhaps the
-    intent.
-    """
-
-    def __init__(self, layer: Layer, view: View) -> None:
-        super().__init__(layer, view)
-        columns = np.arange(len(self.names))
-        far = np.array([name.partition(".")[0] in GROUPS for name in self.names])
-        self.parts = [
-            (view.part([self.names[c] for c in columns[rows]]), columns[rows], belief)
-            for rows, belief in ((~far, belief_of), (far, predictable_belief_of))
-            if rows.any()
-        ]
-        split = [name.partition(".") for name in self.names]
-        self.needs = [
-            (column, offset, NEEDS[last])
-            for column, (side, _, last) in enumerate(split)
-            if (offset := side_of(side)) is not None and last in NEEDS
-        ]
-
-    def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
-        observations = np.empty((state.n, len(observers), len(self.names)), np.float32)
-        for o, body in enumerate(observers.tolist()):
-            known = known_pieces(state, body)
-            for view, columns, belief in self.parts:
-                observations[:, o, columns] = view.observe(belief(state, body), np.array([body]), time_step_s)[:, 0]
-            for column, offset, pieces in self.needs:
-                if 0 < body + offset < known.shape[1]:
-                    observations[~known[:, body + offset, pieces].all(axis=1), o, column] = 0.0
-        return observations
+@cache
+def _parts_and_needs(view: View) -> tuple[list[tuple[View, Ints, Any]], list[tuple[int, int, list[int]]]]:
+    """Parts of a view with their columns and beliefs; and the columns that need pieces, with the sender's offset."""
+    names, columns = view.names, np.arange(len(view.names))
+    far = np.array([name.partition(".")[0] in GROUPS for name in names])
+    parts = [
+        (View([names[c] for c in columns[rows]]), columns[rows], belief)
+        for rows, belief in ((~far, belief_of), (far, predictable_belief_of))
+        if rows.any()
+    ]
+    split = [name.partition(".") for name in names]
+    needs = [
+        (column, offset, NEEDS[feature])
+        for column, (side, _, feature) in enumerate(split)
+        if (offset := side_of(side)) is not None and feature in NEEDS
+    ]
+    return parts, needs
 
 
 class Believer(LayeredScript):

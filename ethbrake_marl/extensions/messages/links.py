@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -37,7 +37,8 @@ from ethbrake_marl.motion.layout import (
 
 MESSAGES_KEY = "messages"  # of the memory in `State.memories`
 
-PIECES = ("place", "speed", "acceleration", "braking_capacity", "latency", "mass", "intent")  # parts of a message
+Piece = Literal["place", "speed", "acceleration", "braking_capacity", "latency", "mass", "intent"]  # of a message
+PIECES: tuple[Piece, ...] = get_args(Piece)
 P_PLACE, P_SPEED, P_ACCELERATION, P_BRAKING, P_LATENCY, P_MASS, P_INTENT = range(len(PIECES))
 
 # rows of a sample: one body at one moment

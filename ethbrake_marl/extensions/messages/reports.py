@@ -8,28 +8,28 @@ exact.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Self
 
 import numpy as np
+from pydantic import ConfigDict, Field, model_validator
 
 from ethbrake_marl.episode.layer import Layer
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.messages.links import loss_number
-from ethbrake_marl.files.model import UNSHOWN, require, suggestion
+from ethbrake_marl.files.model import require
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.elementary import normal_quantile_each
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats
 from ethbrake_marl.worlds.channel import V2X, Extension
 from ethbrake_marl.worlds.counters import Numbers
 from ethbrake_marl.worlds.quantities import OF_WORLD
+from ethbrake_marl.worlds.quantity import ScenarioPart
 from ethbrake_marl.worlds.roles import check_vehicle
 from ethbrake_marl.worlds.scenario import Scenario
 
 NAME = "reports"  # of the key, and of the memory: a whole number below 2^53 for each world, [n]
 NOISE = (6,)  # stream of these numbers
-REPORT_KEYS = ("noise_mps", "bias_mps", "liar")
 MOST_MPS = 50.0  # largest noise and bias
 
 
@@ -66,82 +66,61 @@ class ReportsLayer(Layer):
         return np.tile((bodies != 0) & (bodies != body), (alert.n, 1))
 
 
+class ReportErrors(ScenarioPart):
+    """Content of the key ``reports``."""
+
+    model_config = ConfigDict(json_schema_extra={"minProperties": 1})
+
+    noise_mps: float = Field(
+        default=0.0, ge=0.0, le=MOST_MPS,
+        description="standard deviation of the normal error of reported speeds, drawn anew at every decision",
+    )  # fmt: skip
+    bias_mps: float = Field(default=0.0, ge=-MOST_MPS, le=MOST_MPS, description="constant error of reported speeds")
+    liar: str = Field(
+        default="vehicle_0", description="vehicle that reports no acceleration and no intent, whatever it does"
+    )
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> Self:
+        zeros = [key for key in self.model_fields_set if getattr(self, key) == 0.0]
+        require(not zeros, tuple(zeros[:1]), 0.0, "has no effect; leave it out")
+        require(len(self.model_fields_set) > 0, (), {}, "must set noise_mps, bias_mps or liar")
+        return self
+
+
+class ReportKeys(ScenarioPart):
+    reports: ReportErrors | None = Field(
+        default=None, description="errors of what vehicles report and measure of each other"
+    )
+
+
 class Reports(Extension):
     """Errors in what vehicles report and measure of each other (key ``reports`` of ``v2x``).
 
     The errors are noise and bias of speeds, and one vehicle that lies about its acceleration and intent.
     """
 
-    name = NAME
-    schemas: Mapping[str, dict[str, Any]] = {
-        NAME: {
-            "description": "errors of what vehicles report and measure of each other",
-            "type": "object",
-            "additionalProperties": False,
-            "minProperties": 1,
-            "properties": {
-                "noise_mps": {
-                    "description": "standard deviation of the normal error of reported speeds, drawn anew at every"
-                    " decision",
-                    "type": "number",
-                    "minimum": 0,
-                    "maximum": MOST_MPS,
-                },
-                "bias_mps": {
-                    "description": "constant error of reported speeds",
-                    "type": "number",
-                    "minimum": -MOST_MPS,
-                    "maximum": MOST_MPS,
-                },
-                "liar": {
-                    "description": "vehicle that reports no acceleration and no intent, whatever it does",
-                    "type": "string",
-                },
-            },
-        }
-    }
-
-    def read(self, key: str, value: Any) -> Any:
-        """Value of the key ``reports`` as plain data. Raises an error for unknown keys and for numbers out of range."""
-        right = "must be a mapping, such as {noise_mps: 0.5, bias_mps: 1, liar: vehicle_1}"
-        require(isinstance(value, Mapping) and len(value) > 0, (key,), value, right)
-        for name, content in value.items():
-            at = (key, name)
-            require(
-                name in REPORT_KEYS,
-                at,
-                UNSHOWN,
-                f"unknown key; {suggestion(str(name), REPORT_KEYS) or f'known: {REPORT_KEYS}'}",
-            )
-            if name == "liar":
-                require(isinstance(content, str), at, content, "must be the name of a vehicle, such as vehicle_1")
-                continue
-            low = 0.0 if name == "noise_mps" else -MOST_MPS
-            number = isinstance(content, int | float) and not isinstance(content, bool) and low <= content <= MOST_MPS
-            require(number and content != 0.0, at, content, f"must be from {low:g} to {MOST_MPS:g} m/s, and not 0")
-        return dict(value)
+    name, keys = NAME, ReportKeys
 
     def is_random(self, v2x: V2X) -> bool:
-        return "noise_mps" in _value(v2x)
+        return _errors(v2x).noise_mps > 0.0
 
     def check(self, scenario: Scenario) -> None:
-        """Raise an error if the ``liar`` is no vehicle of the scenario."""
-        liar = _value(scenario.v2x).get("liar")
-        if liar is not None:
-            check_vehicle(liar, scenario.vehicles, ("v2x", NAME, "liar"), liar)
+        """Refuse an unknown liar."""
+        errors = _errors(scenario.v2x)
+        if "liar" in errors.model_fields_set:
+            check_vehicle(errors.liar, scenario.vehicles, ("v2x", NAME, "liar"), errors.liar)
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Floats:
         return numbers(OF_WORLD, NOISE)[:, 0] * 2.0**53
 
     def layer(self, v2x: V2X) -> ReportsLayer:
-        value = _value(v2x)
-        liar = int(value.get("liar", "vehicle_0").removeprefix("vehicle_"))
-        return ReportsLayer(value.get("noise_mps", 0.0), value.get("bias_mps", 0.0), liar)
+        errors = _errors(v2x)
+        return ReportsLayer(errors.noise_mps, errors.bias_mps, int(errors.liar.removeprefix("vehicle_")))
 
 
-def _value(v2x: V2X) -> Mapping[str, Any]:
-    value: Mapping[str, Any] = (v2x.model_extra or {})[NAME]
-    return value
+def _errors(v2x: V2X) -> ReportErrors:
+    return ReportErrors.model_validate((v2x.model_extra or {})[NAME])
 
 
 REPORTS = Reports()

@@ -13,6 +13,7 @@ import numpy as np
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import curves_figure
 from ethbrake_marl.extensions.report.style import TITLES
+from ethbrake_marl.extensions.reproduction.learning import unconverged_policy
 from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, NON_E, WORLD_FIELDS, open_reading
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading

@@ -8,6 +8,7 @@ import numpy as np
 
 from ethbrake_marl.evaluation.statistics import decrease, mean, rate
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, PaperRow, printed_sheet
+from ethbrake_marl.extensions.reproduction.learning import unconverged_policy
 from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,

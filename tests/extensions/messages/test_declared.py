@@ -32,14 +32,16 @@ REFUSED = {
     "v2x.persistence = periodic: needs a channel with separate messages; use a preset": given(
         {"persistence": "periodic"}
     ),
-    "v2x.tells[0] = plce: did you mean place?; known: place, speed, acceleration,": given({"tells": ["plce"]}),
-    "v2x.tells.vehicle_2[1] = 3: known: place, speed": given({"tells": {"vehicle_2": ["mass", 3]}}),
+    "v2x.tells[0] = plce: must be place, speed, acceleration, braking_capacity, latency, mass or intent": given(
+        {"tells": ["plce"]}
+    ),
+    "v2x.tells.vehicle_2[1] = 3: must be place, speed": given({"tells": {"vehicle_2": ["mass", 3]}}),
     "v2x.tells.vehicle_9: unknown vehicle; this scenario has vehicle_1 ... vehicle_3": given(
         {"tells": {"vehicle_9": []}}
     ),
-    "v2x.tells = {}: must be a list of items from place, speed, acceleration, braking_capacity": given({"tells": {}}),
+    "v2x.tells = {}: must not be empty": given({"tells": {}}),
     "v2x.tells = [mass, mass]: must not list an item twice": given({"tells": ["mass", "mass"]}),
-    "v2x.tells.vehicle_2 = mass: must be a list of items from place, speed": given({"tells": {"vehicle_2": "mass"}}),
+    "v2x.tells.vehicle_2 = mass: must be a list": given({"tells": {"vehicle_2": "mass"}}),
     "v2x.tells = [mass]: has no effect, because hears: none means that no": given(
         {"preset": "sensors-only", "tells": ["mass"]}
     ),

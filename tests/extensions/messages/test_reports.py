@@ -31,7 +31,7 @@ def test_bias__is_in_what_others_see_and_nowhere_else() -> None:
     assert (now["own.speed"], now["front_1.gap"]) == (then["own.speed"], then["front_1.gap"])
     assert state.speeds_mps.tolist() == [[20.0, 18.0, 22.0]]
     assert game.seen(state, 2).speeds_mps.tolist() == [[21.0, 18.0, 23.0]]
-    assert game.hides(state, 2).tolist() == [[False, True, False, True]]
+    assert game.layers[0].hides(state, 2).tolist() == [[False, True, False, True]]
 
 
 def test_liar__seems_neither_to_brake_nor_to_mean_it() -> None:
@@ -145,13 +145,13 @@ def v2x(**keys: Any) -> Any:
 
 
 REFUSED: dict[str, Any] = {
-    "v2x.reports = {}: must be a mapping, such as {noise_mps: 0.5": v2x(),
+    "v2x.reports = {}: must set noise_mps, bias_mps or liar": v2x(),
     "v2x.reports.nois_mps: unknown key; did you mean noise_mps (metres per second)?": v2x(nois_mps=1.0),
-    "v2x.reports.noise_mps = -1: must be from 0 to 50 m/s, and not 0": v2x(noise_mps=-1),
-    "v2x.reports.noise_mps = 0: must be from 0 to 50 m/s, and not 0": v2x(noise_mps=0),
-    "v2x.reports.bias_mps = .nan: must be from -50 to 50 m/s": v2x(bias_mps=float("nan")),
-    "v2x.reports.bias_mps = true: must be from -50": v2x(bias_mps=True),
-    "v2x.reports.liar = 1: must be the name of a vehicle, such as vehicle_1": v2x(liar=1),
+    "v2x.reports.noise_mps = -1: must be greater than or equal to 0": v2x(noise_mps=-1),
+    "v2x.reports.noise_mps = 0: has no effect; leave it out": v2x(noise_mps=0),
+    "v2x.reports.bias_mps = .nan: must be a finite number": v2x(bias_mps=float("nan")),
+    "v2x.reports.bias_mps = true: must be a number": v2x(bias_mps=True),
+    "v2x.reports.liar = 1: must be text": v2x(liar=1),
     "v2x.reports.liar = vehicle_7: unknown vehicle; ": v2x(liar="vehicle_7"),
     "it is random what the vehicles learn about each other": lambda: eb.worlds_from_table(
         v2x(noise_mps=1.0)(), {"gap_1_m": [9.0]}
