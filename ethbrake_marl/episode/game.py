@@ -141,8 +141,10 @@ class Game(NamedTuple):
 
     def reset(self, alert: State) -> State:
         """Episodes at their first decision, from worlds at the alert. Scripts decide at the alert."""
-        script_memories = {body: begin_script(script, alert, body) for body, script in self.scripts.items()}
-        decided = ask_scripts(self.scripts, alert._replace(memories={**alert.memories, **script_memories}))
+        decided = alert
+        if self.scripts:
+            script_memories = {body: begin_script(script, alert, body) for body, script in self.scripts.items()}
+            decided = ask_scripts(self.scripts, alert._replace(memories={**alert.memories, **script_memories}))
         state = self.first_decision(decided)
         memories = dict(state.memories)
         if self.rewarding.shaping is not None:
