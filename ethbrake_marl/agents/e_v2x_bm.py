@@ -57,8 +57,8 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
 def harms(alert: State, body: int, decelerations: Floats, count: str, until_s: Floats) -> Floats:
     """Harm if vehicle ``body`` holds each of C decelerations, [2, n, C] m2/s2.
 
-    Row 0 is the harm in ``count``, row 1 the harm in the count that breaks ties. ``decelerations`` [n, C] (m/s2) are
-    separate ones for each world. Harm counts until ``until_s`` [n].
+    Row 0 is the harm in ``count``, row 1 the harm in the count that breaks ties. ``decelerations`` [n, C] (m/s2) may
+    differ between worlds. Harm counts until ``until_s`` [n] (s after the alert).
     """
     return hold(alert, alert.wanted, [body], -decelerations[:, :, np.newaxis], until_s, count)
 
@@ -67,8 +67,8 @@ def search_deceleration(alert: State, body: int, count: str, until_s: Floats) ->
     """Best constant deceleration of vehicle ``body`` (m/s2), with its harm as in ``harms`` (m2/s2), [n, 3].
 
     The search divides the range of decelerations into ``FIRST_PARTS`` equal cells, and then, again and again, every
-    cell that may contain a better deceleration. A result is not within rounding of a jump of the harm, unless the jump
-    is within rounding of an end of one of the first cells.
+    cell that may contain a better deceleration. Rounding cannot carry the result across a jump of the harm, unless the
+    jump is within rounding of an end of one of the first cells.
     """
     best = np.full((alert.n, 3), np.inf)
     rows, step = np.arange(alert.n), alert.braking_capacity_mps2[:, body - 1] / FIRST_PARTS
@@ -87,13 +87,14 @@ def search_deceleration(alert: State, body: int, count: str, until_s: Floats) ->
 
 @large
 def find_cells(rows, at, harm, step, best, cells):
-    """Update the best decelerations; return the number of cells that may contain a better one.
+    """Update ``best``; return the number of cells that may contain a better deceleration.
 
     A cell is the interval between two neighbouring samples. It may contain a better deceleration if the smaller harm at
     its ends, minus the largest change of harm in this cell and its two neighbours, is below the best harm. Row j of
-    ``at`` [m, C] (m/s2) and ``harm`` [2, m, C] (m2/s2) has the samples of the world ``rows[j]``, ``step[rows[j]]`` m/s2
-    apart. ``best`` [n, 3]: best decelerations so far, with their harm in both counts. ``cells`` [2, .] receives, for
-    each of these cells, j and the number of the cell in row j.
+    ``at`` [m, C] (m/s2) and ``harm`` [2, m, C] (m2/s2) has the C samples of the world ``rows[j]``; they are
+    ``step[rows[j]]`` m/s2 apart. ``best`` [n, 3]: best decelerations so far, with their harm in both counts. ``cells``
+    [2, .] receives two numbers for each cell that may contain a better deceleration: j, and the number of the cell in
+    row j.
     """
     count, last = 0, at.shape[1] - 1
     for j in range(at.shape[0]):
@@ -135,7 +136,7 @@ def take_middle(at, harm, best_so_far):
 
 @kernel
 def compare_harm(harm, best_so_far):
-    """-1 if ``harm`` [2] is less than the harm ``best_so_far[1:]``, 0 if equal, 1 if more."""
+    """-1 if ``harm`` [2] is less than ``best_so_far[1:]``, 0 if equal, 1 if more; the second number breaks ties."""
     for count in range(2):  # the other count decides ties
         if abs(harm[count] - best_so_far[count + 1]) > TIE_MARGIN:
             return -1 if harm[count] < best_so_far[count + 1] else 1
@@ -167,7 +168,10 @@ class EV2XBM:
         self.settings, self.agents, self.count = settings, dict(agents), count
 
     def begin(self, alert: State, body: int) -> BaselineMemory:
-        """Command and predicted harm of the episode. Raises ``InvalidInput`` if an agent drives another vehicle."""
+        """Command for the whole episode, and its predicted harm.
+
+        Raises ``InvalidInput`` if ``agents`` contains a vehicle other than ``body``.
+        """
         for vehicle, role in self.agents.items():
             if vehicle != body:
                 raise InvalidInput(

@@ -1,4 +1,4 @@
-"""Policies of other libraries: calls of each kind, and the settings of its training that are applied or refused."""
+"""Policies of other libraries: how each kind is called, and which settings of a training are applied or refused."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def statistics_of(model: Any) -> Any:
 def check_wrappers(policy: Any, who: str) -> None:
     """Raise ``InvalidInput`` if a model was trained under a wrapper that may change observations or actions.
 
-    The same holds for a model that was trained under ``VecNormalize`` and lacks its statistics.
+    Also raised if a model was trained under ``VecNormalize`` and the statistics of ``VecNormalize`` are missing.
     """
     env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
     for layer in [] if env is None else wrappers_of(env):

@@ -38,9 +38,10 @@ class ConstantDeceleration(NamedTuple):
 
 @kernel
 def braking_now(speed, braking, onset, now):
-    """Acceleration of a vehicle at time ``now`` (m/s2), and how long it lasts (s).
+    """Acceleration (m/s2) of a vehicle at time ``now`` (s), and how long this acceleration lasts from then on (s).
 
-    The vehicle coasts until its ``onset`` (s), then brakes from ``speed`` (m/s) to rest with ``braking`` (m/s2).
+    The vehicle has the speed ``speed`` (m/s) now. It coasts until ``onset`` (s), then brakes to rest with ``braking``
+    (m/s2).
     """
     if now < onset:
         return 0.0, onset - now
@@ -53,10 +54,11 @@ def braking_now(speed, braking, onset, now):
 def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset, until):
     """Move a pair to its first impact, or to ``until`` (s); return its harm (m2/s2), the gap (m) and both speeds (m/s).
 
-    ``front`` and ``rear`` are the vehicles' speeds. Each vehicle coasts until its onset (s), then brakes to rest. So
-    the motion has phases of constant acceleration: both coast, one brakes, both brake, one stands (regimes A to C of
-    the proof); the function looks for a contact in each phase. A contact without a closing speed is no impact. If the
-    rear vehicle then brakes less than the front vehicle, they stay in contact, and the harm is 0.
+    ``front`` and ``rear`` are the vehicles' speeds (m/s), ``front_braking`` and ``rear_braking`` their decelerations
+    (m/s2). Each vehicle coasts until its onset (s), then brakes to rest. So the motion has phases of constant
+    acceleration: both coast, one brakes, both brake, one stands (regimes A to C of the proof); the function looks for a
+    contact in each phase. A contact without a closing speed is no impact. If after such a contact the rear vehicle
+    brakes less than the front vehicle, the two stay in contact, and the harm is 0.
     """
     now = 0.0
     while now < until:
@@ -127,12 +129,12 @@ def find_candidates(line, braking, wait, body, at):
 
 @large
 def choose_decelerations(line, braking, wait, body, at, harm, best, least):
-    """Write the best deceleration of vehicle ``body`` in each world to ``best`` [n] (m/s2), and its H to ``least`` [n].
+    """Write the best deceleration of vehicle ``body`` in each world to ``best`` [n] (m/s2), H to ``least`` [n] (m2/s2).
 
     ``line`` is the array of a ``State``, ``braking`` [n, N + 1] each vehicle's braking capacity or present deceleration
     (m/s2), ``wait`` [n, N + 1] the time until each vehicle may begin to brake (s); ``at`` and ``harm`` [C] are working
-    memory. If several candidates are equally good, the result is the middle between the smallest and the largest of
-    them if H is as small there, else the smallest.
+    memory for C candidates. If several candidates are equally good, let a be the smallest and b the largest. The result
+    is ``(a + b) / 2`` if H is as small there, otherwise a.
     """
     for k in range(line.shape[0]):
         find_candidates(line[k], braking[k], wait[k], body, at)

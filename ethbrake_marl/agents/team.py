@@ -81,8 +81,8 @@ class Team(NamedTuple):
     def game(self, game: Game) -> Game:
         """The game with this team's shield.
 
-        Raises ``InvalidInput`` unless the team drives exactly the learners, if it has a shield but no learners, and if
-        the game has another shield.
+        Raises ``InvalidInput`` if the team does not drive exactly the learners, if it has a shield but the game has no
+        learners, or if the game has another shield.
         """
         driven, learners = sorted(self.drivers), sorted(game.settings.learners.tolist())
         if driven != learners:

@@ -137,7 +137,8 @@ def register_feature(
     ``InvalidInput`` for a bad argument.
 
     Args:
-        name: 1 to 64 characters ``a-z``, ``0-9``, ``_``. Lists name a feature of a neighbour ``front_1.NAME``.
+        name: 1 to 64 characters ``a-z``, ``0-9``, ``_``. In a list, the feature of a neighbour is written
+        ``front_1.NAME``.
         function: ``function(state, body)``, or ``function(state, body, neighbour)``, returns the value in every world,
             [n], in ``unit``. ``body`` is the observer; 1 is the front vehicle.
         unit: unit of the value.

@@ -134,7 +134,7 @@ class Game(NamedTuple):
     physics: Physics | None = None  # None: exact impacts
 
     def with_layers(self, layers: Sequence[Layer]) -> Game:
-        """The same game with ``layers`` between the true state and its views and scripts; it has none yet."""
+        """Copy of a game without layers, with ``layers`` between the true state and the game's views and scripts."""
         layers = tuple(layers)
         scripts = {body: script_through(layers, script) for body, script in self.scripts.items()}
         return self._replace(scripts=scripts, layers=layers)
@@ -198,7 +198,7 @@ class Game(NamedTuple):
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """State after one step, and what happened in the step, without the shield; arguments as in ``step``.
 
-        The reward contains only harm of the line and ``terminal``, which the compiled step computes.
+        The reward contains only the two terms that the compiled step computes: ``harm`` of the line and ``terminal``.
         """
         if self.physics is not None:
             return self.physics.follow(self, state, actions)

@@ -1,6 +1,6 @@
 """Prediction of the harm if vehicles hold constant commands, without stops at decisions.
 
-It is fast, but rounds differently from an episode; ``episode.play`` has the same bits as the episode.
+The prediction is fast, but rounds differently from an episode; ``episode.play`` has the same bits as the episode.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def hold_worlds(line, car, wanted, bodies, trials, time, until, weights, tie_wei
 
     Each of C trials starts from ``line``; all other bodies hold ``wanted``. Row 0 of ``out`` is the harm in the count
     with the weights ``weights`` [6], row 1 in the count with ``tie_weights`` [6]. The commands hold from ``time`` to
-    ``until`` (s, [n] each). ``line``, ``car`` and ``wanted`` are arrays of a ``State``. ``memory`` is overwritten:
-    scratch memory of the physics, one line, and its commands.
+    ``until`` (s, [n] each). ``line``, ``car`` and ``wanted`` are arrays of a ``State``. ``memory`` is working memory:
+    scratch of the physics, one line, and the commands of this line.
     """
     scratch, line_copy, commands = memory
     for k in range(trials.shape[0]):

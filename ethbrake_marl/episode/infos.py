@@ -76,7 +76,7 @@ def numbers(state: State, bodies: Ints) -> Floats:
 
 
 def names_of_worlds(state: State, seed: Any) -> dict[str, Any]:
-    """Infos that identify each world (seed, number, list), name -> [n]. ``seed`` is one for all worlds, or [n]."""
+    """Infos ``world_seed``, ``world`` and ``world_listed``, name -> [n]. ``seed``: a number for all worlds, or [n]."""
     number = state.clock[:, NUMBER].astype(np.int64)
     in_evaluation_list = number <= FIRST_IN_LIST
     number_in_list = np.where(in_evaluation_list, FIRST_IN_LIST - number, number)

@@ -61,7 +61,7 @@ class Layer:
         return state
 
     def hides(self, alert: State, body: int) -> Bools:
-        """Whether this layer hides something about each body from vehicle ``body``, [n, N + 1]."""
+        """For each body of the line: whether this layer hides something about it from vehicle ``body``, [n, N + 1]."""
         return np.zeros((alert.n, alert.vehicles + 1), np.bool_)
 
     def infos(self, state: State) -> dict[str, Any]:
@@ -96,7 +96,7 @@ class LayeredScript:
 
 @dataclass(frozen=True, kw_only=True)
 class Observer:
-    """Base class of agents that act on the observations of a view, and observe through ``layers`` themselves."""
+    """Base class of agents that act on the observations of a view. The agent observes the state through ``layers``."""
 
     layers: tuple[Layer, ...] = ()
 
@@ -115,7 +115,7 @@ def script_through(layers: tuple[Layer, ...], script: Any) -> Any:
 
 
 def agent_through(layers: tuple[Layer, ...], agent: Any) -> Any:
-    """The agent behind all layers, if it uses only sensors and messages; any other agent still sees the true state."""
+    """``agent`` behind all ``layers``, if it uses only sensors and messages. Any other agent is unchanged."""
     if isinstance(agent, UserScript):
         return UserScript(agent_through(layers, agent.script))
     if isinstance(agent, Observer):

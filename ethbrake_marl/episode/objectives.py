@@ -223,7 +223,7 @@ def _check_vehicles(text: str, objective: Objective, vehicles: int) -> None:
 
 
 def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: bool) -> list[int]:
-    """Pairs whose impacts cost ``vehicle`` (0: Vehicle 1) nothing: K for Vehicles K and K + 1, 0 with the obstacle.
+    """Pairs whose impacts cost ``vehicle`` (0: Vehicle 1) nothing; K: Vehicles K and K + 1, 0: obstacle and Vehicle 1.
 
     Only for ``weighted`` and ``vehicle_K``, whose weights of 0 may be a mistake. With other objectives, such as ``own``
     or ``social:90``, indifference is intended, and the result is empty. ``obstacle``: whether there is an obstacle.
@@ -289,8 +289,8 @@ def register_objective(
 
     ``function(harm, vehicle)`` returns the amount that ``vehicle`` (0: Vehicle 1) should minimise, [n], for a ``Harm``;
     its docstring describes this amount. With ``arguments`` the objective is written ``name:argument``, and the argument
-    is the function's third parameter: one of these texts, or with ``arguments=float`` any number. Raises
-    ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring.
+    is the function's third parameter: one of the texts in ``arguments``, or any number if ``arguments`` is ``float``.
+    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring.
     """
     form = "a-z, 0-9, - and _, beginning with a letter or digit, and no name of a vehicle"
     meaning = description_of("objective", name, function, r"(?!vehicle_\d+$)[a-z0-9][a-z0-9_-]{0,63}", form)

@@ -116,7 +116,7 @@ class View:
 
     @cached_property
     def plan(self) -> ObservationPlan:
-        """Where each feature of this view comes from: the kernel, a group's function or a feature's function."""
+        """Source of each feature of this view: ``observe_worlds``, a group's function or a feature's function."""
         group_names = list(dict.fromkeys(name.partition(".")[0] for name in self.names if "." in name))
         offsets = [offset for name in group_names if (offset := side_of(name)) is not None]
         kernel_groups = ["own", *(name for name in group_names if side_of(name) is not None)]
@@ -185,7 +185,7 @@ def observe_computed(entry: ComputedFeature, state: State, body: int, offset: in
 
 @kernel
 def full_stop_m(speed, latency_left, capacity):
-    """Stopping distance (m) ``v tau + v^2 / (2 a)`` if brakes act at once; otherwise see ``forces.stopping_m``.
+    """Stopping distance (m) if brakes act at once: ``v tau + v^2 / (2 a)``. For other brakes: ``forces.stopping_m``.
 
     Speed v (m/s), time ``latency_left`` tau (s) without braking, braking ``capacity`` a (m/s2).
     """
@@ -213,11 +213,11 @@ def scale_value(value, scaling, f):
 def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, places, scaling, value, out):
     """Write the scaled features of the built-in groups to ``out`` [n, observers, F].
 
-    ``value`` is working memory for the unscaled features of one observer: group own, the neighbours, role, obstacle.
-    ``role`` and ``obstacle`` say whether to compute these two groups. ``places`` [F] are the positions in ``value`` of
-    the features to write (-1: not written here); if it is empty, all values are written in order. ``line``, ``car``,
-    ``clock`` and ``know`` are arrays of a ``State``. ``offsets`` lead from an observer to the neighbours (-1: the
-    vehicle ahead). ``scaling`` is from ``scaling_of``.
+    ``line``, ``car``, ``clock`` and ``know`` are arrays of a ``State``. ``observers`` are bodies; ``offsets`` lead from
+    an observer to its neighbours (-1: the vehicle ahead). ``role`` and ``obstacle`` say whether to compute the groups
+    of these names. ``scaling`` is from ``scaling_of``. ``value`` is working memory: the unscaled features of one
+    observer, in the order own, neighbours, role, obstacle. ``places`` [F] has the position in ``value`` of each feature
+    of ``out`` (-1: the feature is not written); if ``places`` is empty, all values are written in order.
     """
     bodies = line.shape[2]
     for k in range(len(out)):

@@ -21,8 +21,8 @@ from ethbrake_marl.motion.layout import Floats, scratch_for
 def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, weights, scratch, out):
     """Follow the plans [n, T, L] of the L learners to the end, in place; write the harm (m2/s2) to ``out`` [n].
 
-    An episode stops when its harm is above ``most`` [n]. After T decisions the last actions repeat. The other arguments
-    are those of ``step.step_worlds``.
+    An episode stops when its harm is above ``most`` [n] (m2/s2). After T decisions the last actions repeat. The other
+    arguments are those of ``step.step_worlds``.
     """
     for k in range(len(out)):
         harm = amount_so_far(line[k], weights)
@@ -37,12 +37,12 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, we
 def follow_plans(
     game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf, *, donate: bool = False
 ) -> tuple[State, Floats]:
-    """Last states of episodes whose learners follow ``plans`` from ``state`` on, and their harm, [n] m2/s2.
+    """Last states of episodes whose learners follow ``plans`` from ``state`` on, and the episodes' harm, [n] m2/s2.
 
-    ``plans`` [n, T, L] are the learners' actions at every decision of the episode, from the first one on; the last
-    actions repeat. An episode stops when its harm is above ``most`` [n]. If a check of the physics fails, the harm is
-    infinite; but in games with scripts, ``PhysicsError`` is raised. ``donate``: the arrays of ``state`` may be
-    overwritten.
+    ``plans`` [n, T, L] are the actions of the L learners at the first T decisions of the episode; after these the last
+    actions repeat. An episode stops when its harm is above ``most`` [n] (m2/s2); the result is then its harm so far. If
+    a check of the physics fails, the harm is infinite; but in games with scripts, ``PhysicsError`` is raised.
+    ``donate``: the arrays of ``state`` may be overwritten.
     """
     most = np.full(len(plans), most)
     if game.scripts or game.physics is not None:
@@ -63,5 +63,8 @@ def follow_plans(
 
 
 def price(game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf) -> Floats:
-    """Harm of every episode, [n] m2/s2, if the learners follow ``plans`` from ``state`` on (see ``follow_plans``)."""
+    """Harm of every episode, [n] m2/s2, if the learners follow ``plans`` from ``state`` on (see ``follow_plans``).
+
+    An episode stops when its harm is above ``most`` (m2/s2); the result is then its harm so far.
+    """
     return follow_plans(game, state, plans, count, most)[1]

@@ -186,7 +186,7 @@ def reward_params(reward: Reward) -> RewardParams:
 
 
 class Rewarding(NamedTuple):
-    """A reward, ready to be computed after each step: all terms that the compiled step does not compute itself."""
+    """A reward, prepared for use after each step: parameters, and functions of terms that the compiled step lacks."""
 
     params: RewardParams
     counted: tuple[str, ...]  # names of the terms whose weight is not 0
@@ -208,9 +208,9 @@ class Rewarding(NamedTuple):
     ) -> tuple[Rewarding, StepSettings]:
         """The reward, and the settings of a step, which contain the weights that the compiled step uses.
 
-        ``objective`` is the scenario's. ``times`` are time step and horizon (s). ``vector`` lists the components of a
-        vector reward, or is None. ``report`` names terms whose values the infos contain, even if they have no weight.
-        Warns (``WithoutEffect``) if the objective has no effect.
+        ``objective`` is the scenario's objective. ``times`` are time step and horizon (s). ``vector`` lists the
+        components of a vector reward, or is None. ``report`` names terms whose values the infos contain, even if they
+        have no weight. Warns (``WithoutEffect``) if the objective has no effect.
         """
         params = reward_params(reward)
         declared = objective if params.objective is None else params.objective

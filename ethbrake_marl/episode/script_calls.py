@@ -14,7 +14,7 @@ from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 
 
 class UserScript:
-    """Guards a script from outside this package: its states are read-only, its memories are checked and made read-only.
+    """Guards a script from outside this package: its states and memories are read-only, its results are checked.
 
     Simulations share states and memories, so a script must not change either.
     """

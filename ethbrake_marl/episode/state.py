@@ -195,8 +195,8 @@ class State(NamedTuple):
     def pair_harm(self, count: Count = "first") -> Floats:
         """Harm of each pair of neighbouring vehicles so far, [n, N - 1] m2/s2.
 
-        The pair with the obstacle is left out: impacts with the obstacle and, in the honest cost, Vehicle 1's own
-        driving and motion.
+        The pair of the obstacle and Vehicle 1 is left out. So the result lacks the harm of impacts with the obstacle
+        and, in the honest cost, the price of Vehicle 1's driving and motion.
         """
         self._check_count(count)
         return pair_amounts(self.line, count)[0, :, 1:-1]
@@ -253,7 +253,7 @@ def map_arrays(function: Callable[..., Any], memory: Any, *siblings: Any) -> Any
 
 
 def take(memory: Any, rows: Any) -> Any:
-    """A memory (``map_arrays``) of only the worlds in ``rows``. Slices are copied, so kernels get the usual layout."""
+    """A memory (``map_arrays``) of only the worlds in ``rows``. Slices are copied into the usual memory layout."""
     if isinstance(rows, slice):
         return map_arrays(lambda array: array[rows].copy(), memory)
     places = np.asarray(rows, None if len(rows) else np.int64)
@@ -264,7 +264,7 @@ def take(memory: Any, rows: Any) -> Any:
 def put_rows(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
     """A memory (``map_arrays``) with the arrays of ``new`` in the worlds ``rows``.
 
-    The arrays are copies; with ``donate`` they are the same arrays where these are writable.
+    The old arrays are copied first; with ``donate``, those that are writable are overwritten.
     """
 
     def write_rows(old: Any, part: Any) -> Any:

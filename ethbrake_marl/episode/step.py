@@ -181,8 +181,9 @@ def step_worlds(
 def advance(line, car, clock, wanted, scratch, time_step_s):
     """Advance one running world to its next decision, in place; return the result of ``move_line``, and ``at_rest``.
 
-    ``at_rest``: whether no vehicle moves or would move. The arguments are those of ``step_worlds`` for one world. The
-    decision times are the first one plus multiples of the time step, never sums, so they do not differ by rounding.
+    ``at_rest``: whether no vehicle moves or would move. The arguments are those of ``step_worlds`` for one world. A
+    decision time is computed as the first one plus a multiple of the time step, not by repeated addition, so rounding
+    errors do not add up.
     """
     clock[STEPS] += 1.0
     over = clock[STEPS] >= clock[LAST]

@@ -20,7 +20,8 @@ pair_J_K      minus the harm of the pair of vehicle_J and vehicle_K behind it
 obstacle      minus the harm of impacts with the obstacle
 ============  ==========================================================================================================
 
-``collision``, ``risk``, ``jerk`` and ``terminal`` are terms of the paper, without its misprints.
+``collision``, ``risk``, ``jerk`` and ``terminal`` are terms of the paper, without its misprints. In the formula of
+``risk``, sigma is the logistic function; ``RewardParams`` has the constants.
 """
 
 from __future__ import annotations
@@ -203,7 +204,7 @@ def growth(objectives: Sequence[Objective], count: str, before: State, step: Ste
 
 
 def component(name: str, count: str) -> TermFunction:
-    """Function of the component ``harm_K``, ``pair_J_K`` or ``obstacle`` of a vector reward; the function returns [n].
+    """Function that computes the component ``harm_K``, ``pair_J_K`` or ``obstacle`` of a vector reward, [n].
 
     ``count`` is the name of the count of harm.
     """

@@ -107,13 +107,13 @@ def kernel(function: Function) -> Function:
 
 
 def large(function: Function) -> Function:
-    """Compile a function once, without inlining. Kernels and Python code call it."""
+    """Compile a function once, without inlining it. Kernels and Python code may call it."""
     return _compile(function)
 
 
 @cache
 def stamp_of(file: str) -> str:
-    """Digest of all source files, with their names, that the machine code of the kernels in ``file`` depends on."""
+    """Digest of all source files (names and texts) on which the machine code of the kernels in ``file`` depends."""
     folders, kernel_files = [Path(file).parent], set()
     for folder in folders:  # the loop appends to this list
         for path in folder.glob("*.py"):

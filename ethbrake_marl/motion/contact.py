@@ -22,10 +22,10 @@ def gap_after(gap, closing, pressing, jerk, time):
 def contact(gap, closing, pressing):
     """Time (s) and closing speed (m/s) of a pair's first contact at jerk 0; ``(inf, 0)`` if there is none.
 
-    Let g = ``gap``, w = ``closing``, b = ``pressing`` and ``D = w^2 + 2 b g``. If ``w > 0``, there is no contact for
-    ``D < 0``, otherwise a contact at ``t = 2 g / (w + sqrt(D))``. If ``w <= 0``, there is a contact only for ``b > 0``,
-    at ``t = (sqrt(D) - w) / b``. The closing speed is computed as ``sqrt(D)``; ``w + b t``, which is equal, loses
-    digits by cancellation.
+    Let g = ``gap`` (m), w = ``closing`` (m/s), b = ``pressing`` (m/s2) and ``D = w^2 + 2 b g``. If ``w > 0``, there is
+    no contact for ``D < 0``, otherwise a contact at ``t = 2 g / (w + sqrt(D))``. If ``w <= 0``, there is a contact only
+    for ``b > 0``, at ``t = (sqrt(D) - w) / b``. The closing speed is computed as ``sqrt(D)``; ``w + b t``, which is
+    equal, loses digits by cancellation.
     """
     if closing > 0.0:
         squared = closing * closing + 2.0 * pressing * gap
@@ -43,10 +43,10 @@ def contact(gap, closing, pressing):
 def contact_on_cubic(gap, closing, pressing, jerk, end):
     """Time (s) and closing speed (m/s) of a pair's first contact before ``end`` (s); ``(inf, 0)`` if there is none.
 
-    With w = ``closing``, b = ``pressing`` and j = ``jerk``, the closing speed ``w + b t + j t^2 / 2`` has at most two
-    roots, and the gap is monotone between them. The contact is in the first of these parts that ends with a gap of at
-    most 0. Newton's method finds it there, with a bisection where a step would leave the part. The closed formula for
-    the roots of a cubic would lose digits by cancellation.
+    With w = ``closing`` (m/s), b = ``pressing`` (m/s2) and j = ``jerk`` (m/s3), the closing speed ``w + b t + j t^2 /
+    2`` has at most two roots. They divide the time into parts with a monotone gap. The contact is in the first part
+    that ends with a gap of at most 0. Newton's method finds it there, with a bisection where a step would leave the
+    part. The closed formula for the roots of a cubic would lose digits by cancellation.
     """
     first, second = -math.inf, -math.inf
     squared = pressing * pressing - 2.0 * jerk * closing
@@ -88,7 +88,7 @@ def contact_on_cubic(gap, closing, pressing, jerk, end):
 def first_return(value, rate, jerk):
     """First t > 0 (s) at which ``value + rate t + jerk t^2 / 2`` is 0; infinite if there is none.
 
-    If ``value`` is 0 now, the result is the next time.
+    If ``value``, the value at t = 0, is 0, the result is the next zero.
     """
     if value == 0.0:
         return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf

@@ -119,7 +119,7 @@ def settle(low, high, low_jerk, high_jerk):
     """Acceleration (m/s2) and jerk (m/s3) of a body: the value nearest to 0 in the range ``[low, high]`` (m/s2).
 
     The body's own forces allow the accelerations in this range. ``low_jerk`` and ``high_jerk`` (m/s3) are the rates at
-    which its two ends change.
+    which the two ends of the range change.
     """
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk

@@ -56,15 +56,14 @@ SAME_MPS2 = 5e-13  # touching bodies with accelerations closer than this move al
 
 @large
 def pool(mass, low, high, low_jerk, high_jerk, scratch, first, last, value, jerk):
-    """Write the isotonic regression of the bodies ``first..last`` to ``value`` and ``jerk``; return the block count.
+    """Write the isotonic regression of bodies ``first..last`` to ``value`` and ``jerk``; return the number of blocks.
 
-    A body whose value is above the value of the body in front forms a *block* with it. All bodies of a block get the
-    same value: ``settle`` of the mean of their ranges, weighted by mass. A block with a body of infinite mass gets the
-    value 0.
+    Each body has a range of values from ``low`` to ``high``: accelerations, or speeds, for which both ends are equal.
+    ``low_jerk`` and ``high_jerk`` are the rates at which the two ends change. All are rows [N + 1].
 
-    ``low`` and ``high`` are the ends of each body's range (accelerations, or speeds, for which both ends are equal),
-    ``low_jerk`` and ``high_jerk`` the rates of the ends; all are rows [N + 1]. The blocks are written to the rows BLOCK
-    of ``scratch``.
+    A body whose value is above the value of the body in front forms a *block* with it. The ranges of a block's bodies
+    are averaged, weighted by mass, and ``settle`` turns the mean range into the one value of the block. A block with a
+    body of infinite mass gets the value 0. The blocks are written to the rows BLOCK of ``scratch``.
     """
     count = 0
     for i in range(first, last + 1):
@@ -103,9 +102,9 @@ def pool(mass, low, high, low_jerk, high_jerk, scratch, first, last, value, jerk
 
 @kernel
 def restitution(car, closing):
-    """Coefficient of restitution, 0 to 1, of an impact with the largest closing speed ``closing`` (m/s).
+    """Coefficient of restitution, 0 to 1, of an impact whose largest closing speed is ``closing`` (m/s).
 
-    An impact with less than ``PLASTIC_MPS`` is plastic: 0.
+    If ``closing`` is below ``PLASTIC_MPS``, the impact is plastic: 0.
     """
     return car[RESTITUTION, 0] if closing >= PLASTIC_MPS else 0.0
 
@@ -116,8 +115,8 @@ def resolve_cluster(line, car, scratch, first, last):
 
     The impact is plastic (e = 0) if the largest closing speed is below ``PLASTIC_MPS``. The common speed of each block
     is corrected by its mean rounding error, so momentum is conserved to 4 eps of ``sum(m |v|)`` for any masses. After a
-    plastic impact no body may be faster than the body in front by rounding, or two blocks could exchange a rounding
-    error forever. A body that is not struck keeps its speed bit for bit.
+    plastic impact, a body that is faster by rounding than the body in front gets the speed of the body in front:
+    otherwise two blocks could exchange a rounding error forever. A body that is not struck keeps its speed bit for bit.
     """
     largest = 0.0
     for p in range(first, last):
@@ -147,8 +146,8 @@ def resolve_cluster(line, car, scratch, first, last):
 def note_thrown(line, scratch, p):
     """Add the change of pair p's closing speed in an impact to the row THROWN; the pair has had an impact before.
 
-    If pair p itself closes in this impact, also add to the row PUSHED the part of the change that takes up closing
-    speed that forces had built up.
+    If pair p itself closes in this impact, a part of the change takes up closing speed that forces had built up. This
+    part is added to the row PUSHED.
     """
     change = (line[SPEED, p + 1] - scratch[BEFORE, p + 1]) - (line[SPEED, p] - scratch[BEFORE, p])
     closing = scratch[CLOSING, p]
@@ -180,8 +179,8 @@ def note_passed(line, car, scratch, first, last):
 
     A contact takes up the closing speed ``v_rear - v_front``: v_rear is the speed after the impact that the body behind
     the contact would have if no body were in front of it; v_front is the speed that the body in front of the contact
-    would have if no body were behind it. The harm passed on is the square of this, minus the harm of the pair's own
-    closing speed. So vehicles that touch when one of them is struck are not spared the harm that they would bear a
+    would have if no body were behind it. The harm passed on is ``(v_rear - v_front)^2`` minus the harm of the pair's
+    own closing speed. So vehicles that touch when one of them is struck are not spared the harm that they would bear a
     millimetre apart.
     """
     for p in range(first, last if last - first > 1 else first):  # two bodies pass nothing on
@@ -194,9 +193,9 @@ def note_passed(line, car, scratch, first, last):
 
 @large
 def next_of_series(car, scratch, now, first, last):
-    """Pair of a cluster that the next impact of an endless series strikes; -1: no series, the whole cluster is struck.
+    """Pair that is struck next in a cluster's endless series of impacts; -1: no series, the whole cluster is struck.
 
-    All other pairs of the cluster then count as not closing.
+    In a series, all other pairs of the cluster count as not closing.
 
     If impacts are plastic, a light vehicle may rattle between two others: each gap is about the square of the gap
     before, until the gap is 0 in floating-point numbers and the pairs touch. The rest of the series then happens at

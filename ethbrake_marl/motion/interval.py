@@ -1,9 +1,9 @@
 """Motion of one line of bodies through an interval of constant commands, from event to event.
 
 ``builds`` says whether the force of some body follows its command at a finite rate. Between two events the jerk of
-every body is constant; without such a body it is 0, and the compiler drops the jerk where ``builds`` is the constant
-False. ``ahead`` is the first body that takes part: the obstacle (0), or Vehicle 1 (1) if there is no obstacle. Times
-within an interval count from its start.
+every body is constant. If ``builds`` is False, the jerk is 0; where ``builds`` is the constant False, the compiler
+drops the jerk. ``ahead`` is the first body that takes part: the obstacle (0), or Vehicle 1 (1) if there is no obstacle.
+Times within an interval count from its start.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ LATE_S, LATE_MPS2 = 1e-9, 1e-12  # delay of a parting, so that rounding cannot u
 
 @kernel
 def crossing_s(below, rate):
-    """Time (s) until a value of ``below`` (m/s2, at most 0), which grows at ``rate`` (m/s3), is surely above 0."""
+    """Time (s) until a value that is now ``below`` (m/s2, at most 0) and grows at ``rate`` (m/s3) is surely above 0."""
     return math.inf if rate <= 0.0 else max(-below / rate, 0.0) + LATE_S + LATE_MPS2 / rate
 
 
@@ -145,9 +145,9 @@ def accelerate(line, car, scratch, ahead, builds):
 
 @kernel
 def next_event(line, car, scratch, now, end, parting, ahead, builds):
-    """Write the time to the next event of every body and pair; return the time (s) to the first, at most ``end - now``.
+    """Write the time (s) to the next event of every body and pair; return the time to the first, at most ``end - now``.
 
-    Events: two bodies make contact or part (in ``parting`` s); a body comes to rest or reaches its speed limit; a
+    Events: two bodies make contact or part (``parting`` s from now); a body comes to rest or reaches its speed limit; a
     command takes effect; a force reaches its command or 0.
     """
     bodies, soonest = line.shape[1], min(end - now, parting)
@@ -250,12 +250,12 @@ def solo(speed, command, onset, limit, duration):
 
 @kernel
 def move_apart(line, car, scratch, duration, ahead, builds):
-    """Move the line through the whole interval at once if surely no two bodies touch; return whether that was possible.
+    """Move the line through the whole interval at once if surely no two bodies touch; return whether it was moved.
 
-    Without contact a speed only rises or only falls within the interval, so a gap shrinks by at most ``duration`` (s)
-    times (largest rear speed minus smallest front speed). If the gap is smaller than that, and both accelerations are
-    constant, ``contact`` decides. The line is not moved if a force changes within the interval or a body moves
-    backward.
+    Without contact a speed only rises or only falls within the interval. So a gap shrinks by at most ``duration`` (s)
+    times (largest rear speed minus smallest front speed). Where this bound reaches the gap, ``contact`` decides, if
+    both accelerations are constant; if not, the line is not moved. It is not moved either if a force changes within the
+    interval or a body moves backward.
     """
     bodies, slowest, front = line.shape[1], math.inf, 0.0
     for i in range(ahead, bodies):
@@ -288,7 +288,7 @@ def move_apart(line, car, scratch, duration, ahead, builds):
 def through_interval(line, car, scratch, start, until, ahead, builds):
     """Move one line as ``move_line`` does: at once if no two bodies touch, otherwise from event to event.
 
-    ``builds`` must be a constant.
+    ``builds`` must be the constant True or False (module docstring).
     """
     bodies, duration, outcome, now = line.shape[1], until - start, NO_CONTACT, 0.0
     for i in range(ahead, bodies):
@@ -343,8 +343,8 @@ def through_interval_building(line, car, scratch, start, until, ahead):
 def note_driving(line, car, wanted, start, until):
     """Add the speed that each vehicle's engine alone gives from ``start`` to ``until`` (s) to the row DROVE.
 
-    ``line`` is the line at ``start``. The speed depends on the vehicle's own force and command only: no contact makes
-    driving free.
+    ``line`` is the line at ``start``; ``wanted`` [N + 1] are the commands (m/s2). The speed that the engine gives
+    depends only on the vehicle's own force and command: no contact makes driving free.
     """
     for i in range(1, line.shape[1]):
         if wanted[i] > 0.0 or line[FORCE, i] > 0.0:

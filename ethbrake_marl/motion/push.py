@@ -53,9 +53,10 @@ def integral_of_largest(value, rate, count, duration):
 def group_acceleration(car, scratch, body, last, toward, side, held):
     """Acceleration (m/s2) of ``body`` if only the bodies from ``body`` to ``last`` existed.
 
-    ``toward`` is 1 for the bodies behind a contact, whose largest mean acceleration counts, and -1 for the bodies in
-    front, whose smallest counts. ``side`` is the row of ``scratch`` with the accelerations by the bodies' own forces.
-    ``held``: the block keeps its speed, so brakes may hold any part of it.
+    The mean accelerations of the bodies from ``body`` to j are compared, for every j up to ``last``. ``toward`` is 1
+    for the bodies behind a contact: the largest mean counts. It is -1 for the bodies in front: the smallest mean
+    counts. ``side`` is the row of ``scratch`` with the accelerations by the bodies' own forces. ``held``: the block
+    keeps its speed, so brakes may hold any part of it.
     """
     most, mass, i = toward * scratch[side, body], car[MASS, body], body
     force = mass * most
@@ -69,7 +70,7 @@ def group_acceleration(car, scratch, body, last, toward, side, held):
 
 @large
 def gain(car, scratch, body, last, toward, side, side_jerk, held, duration):
-    """Change of speed (m/s) of ``body`` by ``group_acceleration`` in ``duration`` (s), if brakes build up.
+    """Integral of ``group_acceleration`` over ``duration`` (s), if brakes build up: a change of speed (m/s).
 
     ``side_jerk`` is the row of ``scratch`` with the rates of the row ``side``.
     """

@@ -50,7 +50,8 @@ class EpisodeShield:
     Args:
         drivers: the learner's vehicle (1: Vehicle 1) -> its policy.
         harm_count: harm to compare: ``first``, ``total`` or ``honest`` (``episode.counts``).
-        bound: how H* is computed: ``coupled`` (the episode's own physics) or ``pairwise`` (the paper's closed form).
+        bound: how H*, the harm of E-V2X-BM, is computed: ``coupled`` (the episode's own physics) or ``pairwise`` (the
+        paper's closed form).
 
     """
 

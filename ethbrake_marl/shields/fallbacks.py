@@ -54,9 +54,10 @@ def constant_plans(game: Game, actions: Floats) -> Floats:
 def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
     """Constant actions with the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
 
-    Candidates are the next actions of ``plans`` [n, T, L] with one of ``CHANGES`` added to all of them; with several
-    learners also each of ``SINGLE_ACTIONS`` for one learner while the others hold the plan's next actions. ``states``
-    may contain several possible states of each world, in consecutive rows; then the largest of their harms counts.
+    A candidate is the next actions of ``plans`` [n, T, L] with one of ``CHANGES`` added to all of them. With several
+    learners there are more candidates: one learner holds one of ``SINGLE_ACTIONS``, the others hold the plan's next
+    actions. ``states`` may contain several possible states of each world, in consecutive rows; then the largest harm
+    over these states counts.
     """
     learners, rows, states_per_world = game.settings.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
     planned = plans[rows, np.minimum(states.steps[::states_per_world], plans.shape[1] - 1)]

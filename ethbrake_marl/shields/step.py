@@ -117,14 +117,15 @@ class StepShield:
     # A subclass for worlds that may be in one of M states overrides the next two; ``first_memory`` gets the states.
 
     def possible_states(self, state: State, memory: StepShieldMemory) -> State:
-        """Possible states of each world, in M consecutive rows, the nominal state first. Here M = 1."""
+        """Possible states of each world, in M consecutive rows; rollouts of agents start from the first. Here M = 1."""
         return state
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
         """Harm of each plan, [n] m2/s2: the largest over the M possible states of a world.
 
-        ``states`` has M rows per world; ``plans`` is [n, T, L]. A simulation stops when its harm is above ``most``. The
-        harm is infinite if a vehicle would bear more than its cap (``caps`` [n, N] m2/s2).
+        ``states`` has M rows per world; ``plans`` is [n, T, L]. A simulation stops when its harm is above ``most``
+        (m2/s2); the result is then its harm so far. The harm is infinite if a vehicle would bear more than its cap
+        (``caps`` [n, N] m2/s2).
         """
         last, harm = follow_plans(game, states, plans, self.count, most)
         if caps is not None:
@@ -252,8 +253,8 @@ class StepShield:
         """Search, in R worlds, for plans that begin with ``actions`` and keep the bound; store them in ``memory``.
 
         ``rows`` [R]: the worlds. ``actions`` [R, L]: actions at the decision with the number ``now`` [R]. The rest of
-        the present plan is tried first, then the fallbacks ``rests``. Returns the reasons, and the smallest price or
-        estimate among the plans tried (m2/s2), [R] each.
+        the present plan is tried first, then the fallbacks ``rests``. Returns the reasons (``ShieldReason``), and the
+        smallest price or estimate among the plans tried (m2/s2), [R] each.
         """
         most, plans = self.bound(memory)[rows], memory.plan[rows]
         plans[np.arange(len(rows)), now] = actions
@@ -313,7 +314,7 @@ def take_worlds(states: State, rows: Ints, M: int) -> State:
 
 @cache
 def trials(learners: int) -> Bools:
-    """Mask of the trials, [1 + L, L]: first all learners' proposals, then each learner's alone. [1, 1] if L = 1."""
+    """Whose proposals each trial contains, [1 + L, L]: first all, then each learner's alone; [1, 1] if L = 1."""
     alone = np.eye(learners, dtype=np.bool_)
     return alone if learners == 1 else np.concatenate([alone.any(axis=0, keepdims=True), alone])
 
