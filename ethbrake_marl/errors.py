@@ -47,9 +47,8 @@ def count_of(n: int, thing: str) -> str:
 def describe_error(error: BaseException, path: str | None = None) -> str:
     """Short text about an exception from a user's code: class, message, and the line that raised it.
 
-    ``path``: the user's file; the line is then the last one of this file in the traceback. None: the innermost line of
-    the traceback, which is left out if this package raised the error. An error of this package is described without its
-    class.
+    ``path``: the user's file; the line is then the last one in the traceback that belongs to this file. None: the
+    innermost line, or no line if this package raised the error. The class of this package's own errors is not named.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -200,7 +199,7 @@ class CacheFault(UserWarning):
 
 
 class FreeImpacts(UserWarning):
-    """An objective gives some impact no weight, so causing it costs nothing."""
+    """An objective gives some impact no weight, so causing this impact costs nothing."""
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
@@ -217,7 +216,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number in [``least``, ``most``]; ``what`` names it."""
+    """Raise ``InvalidInput`` unless ``value`` is a whole number in [``least``, ``most``]. ``what`` names ``value``."""
     is_whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (is_whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"

@@ -158,7 +158,7 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
 
 
 def wrap_team(team: Team, wrapper: str, settings: AgentSettings) -> Team:
-    """Team with a shield or search around it. ``wrapper``: its name, such as ``episode:pairwise``."""
+    """Team with a ``wrapper`` around it: the name of a shield or search, such as ``episode:pairwise``."""
     entry, argument = _look_up(WRAPPERS, *wrapper.partition(":")[::2])
     result: Team = _call_maker(settings.spec, entry.make, team, argument, settings)
     return result._replace(name=settings.spec)
@@ -172,9 +172,10 @@ def team_of(driver: Driver, scenario: Scenario) -> Team:
 
 
 def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Teams by name, spec -> team. ``specs``: a list, or a text with commas between specs; groups are expanded.
+    """Team of each spec (the name of an agent, such as ``ppo+step``): spec -> team.
 
-    Raises the errors of ``make_agent``, and ``InvalidInput`` for a repeated spec.
+    ``specs``: a list, or a text with commas between specs. A group of agents is replaced by its specs. ``harm_count``:
+    as in ``make_agent``. Raises the errors of ``make_agent``, and ``InvalidInput`` for a repeated spec.
     """
     teams: dict[str, Team] = {}
     for name in split_specs(specs) if isinstance(specs, str) else specs:
@@ -186,11 +187,11 @@ def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: st
 
 
 def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Teams by name, name -> team, for any description of agents.
+    """Teams for any description of agents: name -> team.
 
     ``agents`` is a text or list as in ``make_teams``; or a mapping from names to specs, agents, teams, or mappings from
     vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``. Raises ``InvalidInput`` for
-    anything else.
+    anything else. ``harm_count``: as in ``make_agent``.
     """
     if isinstance(agents, str) or (isinstance(agents, Iterable) and not isinstance(agents, Mapping)):
         return make_teams(agents, scenario, harm_count=harm_count)
@@ -228,7 +229,7 @@ def group(name: str) -> list[str]:
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a text into specs at its commas. Raises ``InvalidInput`` for an existing path with a comma or plus."""
+    """Split a text into specs (names of agents) at its commas. An existing path with a comma or plus is refused."""
     begins = [match.end() for match in re.finditer(r"^|[,@]", text)]
     ends = [match.end() for match in re.finditer(r"(?=[,+]|$)|\.py(?=:)", text)]
     for begin, end in product(begins, ends):
@@ -373,7 +374,7 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
 
 
 def listed_agents() -> list[AgentEntry]:
-    """Entries of all agents and wrappers that can be loaded, without groups. The form of a wrapper begins with +."""
+    """Entries of all agents and wrappers that can be loaded, without groups. A wrapper's ``form`` begins with ``+``."""
     agents = [entry for entry in AGENTS.usable().values() if callable(entry.make)]
     return agents + [replace(entry, form=f"+{entry.form}") for entry in WRAPPERS.usable().values()]
 

@@ -46,9 +46,9 @@ class Progress:
 
     @staticmethod
     def listener(on_progress: ProgressOption) -> OnProgress | None:
-        """Function that receives each ``Progress``; None: no reports.
+        """Function to call with each ``Progress``; None: no reports.
 
-        ``on_progress`` is a function; or ``"show"``: print progress on stderr (if there is one); or None.
+        ``on_progress``: this function, None, or ``"show"``: print progress on stderr (if the process has one).
         """
         if on_progress == "show":
             return None if sys.stderr is None else ShownProgress()

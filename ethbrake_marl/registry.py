@@ -65,7 +65,7 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def package_points(group: str) -> list[EntryPoint]:
-    """Entry points of a group for this package's own parts, from its tables ``parts.py``."""
+    """Entry points of a group that this package itself defines, in the files ``parts.py`` of core and extensions."""
     package = __name__.rpartition(".")[0]
     folder = files(package) / "extensions"
     extensions = [path.name for path in folder.iterdir() if (path / "parts.py").is_file()] if folder.is_dir() else []
@@ -93,8 +93,9 @@ def versions_used() -> dict[str, str]:
 class Registry(Mapping[str, T]):
     """Name -> object, for all objects of one kind. An object is loaded when its name is first looked up.
 
-    Iterating, and testing whether a name exists, load nothing. Looking up a name raises ``UnknownName``; or
-    ``InvalidInput`` if the object cannot be loaded or two packages define it; or ``MissingExtra``.
+    Iterating, and testing whether a name exists, load nothing. Looking up a name raises ``UnknownName``,
+    ``InvalidInput`` if the object cannot be loaded or two packages define it, and ``MissingExtra`` if an optional
+    package is missing.
 
     Args:
         kind: noun for one object in messages, for example ``agent``.
@@ -132,7 +133,8 @@ class Registry(Mapping[str, T]):
         return self.loaded[name]
 
     def load(self, name: str) -> list[str]:
-        """Load an object if needed; return the names that its entry point defines (a dictionary defines several).
+        """Load an object if needed. Return all names that its entry point defines: several if its value is a
+        dictionary.
 
         Raises the errors of looking up a name.
         """

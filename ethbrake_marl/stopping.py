@@ -61,7 +61,7 @@ class Postponed:
     def end(self, *, only_arrived: bool = False) -> None:
         """Stop postponing, and act on a Ctrl-C that has arrived.
 
-        ``only_arrived``: if none has arrived, postpone further.
+        ``only_arrived``: if no Ctrl-C has arrived, keep postponing.
         """
         if self._handler is not None and _in_main_thread() and (self._arrived or not only_arrived):
             handler, self._handler = self._handler, None

@@ -244,7 +244,7 @@ class Installed(TyperCommand):
 
 
 def with_installed(group: Any, name: str) -> Any:
-    """Command group ``name``, after the installed commands with entry points ``NAME.COMMAND`` were added to it."""
+    """Command group ``name``, to which this call adds the installed commands with entry points ``NAME.COMMAND``."""
     for entry in points(COMMANDS.group):
         owner, _, command_name = entry.rpartition(".")
         if owner == name:

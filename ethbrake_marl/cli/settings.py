@@ -19,7 +19,7 @@ NO_SETTING = {"name", "title", "description", "source"}  # words, which cannot b
 
 
 class CommandSettings(NamedTuple):
-    """Settings of a command, by what they change."""
+    """Settings (``--set``) of a command, sorted by what they change."""
 
     texts: tuple[str, ...]  # as written
     scenario: list[Override]

@@ -121,7 +121,7 @@ def run_folder(scenario: str, recipe: str, scheme: str | None, seed: int) -> Pat
 
 
 def change_recipe(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
-    """Recipe after the command line's settings.
+    """Recipe ``plan`` with the settings ``overrides`` of the command line.
 
     Prints a note if the discount ``gamma`` then differs from the discount of reward shaping.
     """

@@ -21,10 +21,10 @@ STAY = "\u00a0"  # a space at which no line ends
 
 
 def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
-    """Quantities of worlds, name -> value, or ``[smallest, largest]`` if the worlds differ.
+    """Quantities of worlds, key -> value, or ``[smallest, largest]`` if the worlds differ.
 
     A quantity of vehicles or pairs has a list with an entry for each of them: ``{"gaps_m": [7.0, [5.0, 9.0]],
-    "restitution": 0.1}``. ``worlds``: columns, name -> [n]. Rates that no vehicle has are left out.
+    "restitution": 0.1}``. ``worlds``: columns, name -> [n]. A column without any number is left out.
     """
     ranges: dict[str, Any] = {}
     for key, rule in QUANTITIES.items():
@@ -38,7 +38,7 @@ def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def caption(parameters: Mapping[str, Any]) -> str:
-    """One line with scenario, number of worlds, seed, recordings and quantities, from the ``parameters`` of a table."""
+    """One line with scenario, number of worlds, seed, recordings and quantities, from ``SummaryTable.parameters``."""
     parts = []
     for key, (symbol, unit) in SYMBOLS.items():
         if key in parameters:

@@ -234,8 +234,8 @@ def _join_columns(parts: Sequence[Columns]) -> Columns:
 def hidden_from(alert: State, game: Game) -> Bools:
     """Whether the V2X channel hides something from a learner at its first decision, [n].
 
-    True if the learner lacks a quantity of another vehicle, or if another vehicle reacts later than the latency that it
-    reports, because it must first receive a message.
+    True if the learner lacks a quantity of another vehicle. Also true if another vehicle waits for a message, and so
+    reacts later than the latency that it reports.
     """
     late, hidden = alert.car[:, LATENCY] > alert.car[:, OWN_LATENCY], np.zeros(alert.n, np.bool_)
     for i in game.settings.learners.tolist():

@@ -64,7 +64,7 @@ class Watch(Protocol):
 
 
 class Statistic(NamedTuple):
-    """Statistic of a column, for tables and JSON.
+    """Statistic of a measure's column, for tables and JSON.
 
     The kind ``rate`` is the share of worlds in which the column is true, ``difference`` the mean difference from the
     baseline, ``decrease`` 1 - (mean) / (mean of the baseline).
@@ -90,7 +90,8 @@ class Measure(NamedTuple):
 def measure_columns(measure: Measure, measurement: MeasureValue, last: State) -> dict[str, MeasureValues]:
     """Columns of a measure, name -> [n], from the value that the measure returned.
 
-    Raises ``InvalidInput`` for a wrong shape or type, and for numbers that are not finite.
+    ``last``: last states of the episodes. Raises ``InvalidInput`` for a wrong shape or type, and for numbers that are
+    not finite.
     """
     if measurement is None:
         return {}
@@ -154,8 +155,8 @@ def ended(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 def predicted_harm(game: Game, alert: State, last: State) -> MeasureValue:
-    """Harm that an agent or a shield predicted at the alert, in the count that it minimises. Defined if exactly one of
-    them predicts.
+    """Harm that an agent or a shield predicted at the alert, in the count of harm that it minimises. Defined if exactly
+    one agent or shield predicts.
     """
     memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.settings.learners.tolist())]
     predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
@@ -163,8 +164,8 @@ def predicted_harm(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 def replaced(game: Game, alert: State, last: State) -> MeasureValue:
-    """actions: number of actions that the shield replaced; none: whether it replaced none or, if it chooses once per
-    episode (Algorithm 1), chose the policy.
+    """actions: number of actions that the shield replaced; none: whether it replaced no action. A shield that chooses
+    once per episode (Algorithm 1) has only none: whether it chose the policy.
     """
     memory: Any = last.memories.get("shield")
     if hasattr(memory, "chosen"):

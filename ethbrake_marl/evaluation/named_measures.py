@@ -109,8 +109,8 @@ def split_names(names: str) -> list[str]:
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
     """Measures with these names, without duplicates: registered measures, summed terms of a reward, objectives.
 
-    ``FILE.py:NAME`` runs the file and takes its measure NAME, which is called ``FILE.py:NAME`` if two measures of the
-    result would be called ``NAME``. Raises ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
+    ``FILE.py:NAME`` runs the file and takes its measure NAME. If the result contains another measure NAME, this one is
+    called ``FILE.py:NAME``. Raises ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
     """
     if not isinstance(names, Iterable):
         raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'pushed_mps,pushed_m'")
@@ -195,7 +195,7 @@ def _objective(name: str, game: Game, alert: State, last: State) -> MeasureValue
 
 
 class SummedTerm:
-    """A ``Watch`` that sums a term of a reward over all steps."""
+    """Measures the sum of a term of the reward over all steps (a ``Watch``)."""
 
     def __init__(self, term: TermFunction, game: Game, alert: State) -> None:
         self.term, self.sum = term, np.zeros(alert.n)

@@ -28,7 +28,7 @@ def own_way_m(alert: State, body: int, until_s: float) -> Floats:
 
 
 def with_post(state: State) -> Floats:
-    """Copy of ``state.line`` with an imaginary post far ahead of Vehicle 1 unless an obstacle is there.
+    """Copy of ``state.line`` with an imaginary post far ahead of Vehicle 1, except in worlds with an obstacle.
 
     The gap ahead of Vehicle 1 then shows how far the vehicle moves.
     """
@@ -38,9 +38,9 @@ def with_post(state: State) -> Floats:
 
 
 class PushedAway:
-    """A ``Watch`` that measures how far vehicles end beyond the place they would reach by the horizon if untouched.
+    """Measures how far vehicles end beyond the place that they would reach by the horizon if untouched (a ``Watch``).
 
-    Negative if a vehicle ends short of that place, for instance because an obstacle threw it back.
+    The distance is negative if a vehicle ends short of that place, for instance because an obstacle threw it back.
     """
 
     def __init__(self, bodies: list[int], game: Game, alert: State) -> None:
@@ -48,14 +48,17 @@ class PushedAway:
         self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Add the distance that Vehicle 1 travels in this step, which is simulated again (``with_post``)."""
+        """Simulate the step again (``with_post``), and add the distance that Vehicle 1 travels."""
         line = with_post(before)
         from_m = line[:, GAP, 0].copy()
         advance_worlds(line, before.car, before.time_s, after.time_s, after.wanted, scratch_for(line.shape[2]))
         self.way_m += from_m - line[:, GAP, 0]
 
     def result(self, last: State) -> MeasureValue:
-        """Excess distance, vehicle number -> [n] m; ``1_far``: whether Vehicle 1's exceeds ``PUSHED_FAR_M``, [n]."""
+        """Excess distance of each vehicle, vehicle number -> [n] m.
+
+        ``1_far`` [n]: whether the distance of Vehicle 1 exceeds ``PUSHED_FAR_M``.
+        """
         wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
         metres = {
             f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - untouched_m
@@ -66,7 +69,8 @@ class PushedAway:
 
 def pushed_m(game: Game, alert: State) -> PushedAway | None:
     """How far a vehicle ends beyond the place where it would stop untouched, because of impacts and pushes. In reality
-    it brakes for something, so this is dangerous. Defined for vehicles that neither learn nor observe the state.
+    the vehicle brakes for something there, so this is dangerous. Defined for vehicles that neither learn nor observe
+    the state.
     """
     bodies = [i for i in range(1, alert.vehicles + 1) if i not in game.settings.learners and i not in game.scripts]
     return PushedAway(bodies, game, alert) if bodies else None
@@ -86,8 +90,8 @@ def pushed_mps(game: Game, alert: State, last: State) -> MeasureValue:
 def first_impact_s(before: State, after: State) -> Floats:
     """Time of the line's first impact if it lies between the two states, [n] s.
 
-    ``before.time_s`` if it was earlier, ``after.time_s`` if it is later or never. There must be no decision between the
-    two states.
+    Otherwise ``before.time_s`` after an earlier impact, and ``after.time_s`` if no impact has happened yet. There must
+    be no decision between the two states.
     """
     until: Floats = np.where(before.collided, before.time_s, after.time_s)
     for k, scratch in simulate_again(before, after, ~before.collided & after.collided):
@@ -137,7 +141,7 @@ def drove_towards(game: Game, alert: State) -> DroveTowards:
 
 
 def still_moving(game: Game, alert: State, last: State) -> MeasureValue:
-    """Whether a vehicle of each world still moves at the end, which is then at the horizon."""
+    """Whether some vehicle still moves when the episode ends, which is then at the horizon."""
     return last.moving
 
 

@@ -37,7 +37,10 @@ SAMPLE_S = 0.02  # usual time between two samples
 
 @dataclass(frozen=True)
 class Impacts:
-    """The m impacts of one episode, in order of time. Several impacts of a pair between two samples are one entry."""
+    """The m impacts of one episode, in order of time.
+
+    If a pair has several impacts between two samples of the record, they are one entry.
+    """
 
     time_s: Floats  # [m] of the first impact in the entry
     pair: Ints  # [m] 0: Vehicle 1 with the obstacle, p: vehicle_p and the one behind it
@@ -80,7 +83,7 @@ class EpisodeRecord:
 
     @property
     def last(self) -> State:
-        """The state at the end."""
+        """The state at the end of the episode."""
         return self.states[-1]
 
     def __repr__(self) -> str:

@@ -76,10 +76,11 @@ def decrease(values: Floats, baseline: Floats, clusters: Clusters = None) -> Est
 def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
     """Share p of worlds that are true, with Wilson's score interval, which lies within [0, 1].
 
-    The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width ``z sqrt(p (1 - p) / n + z^2 /
-    (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of independent worlds with the same standard error, ``1 +
-    p (1 - p) / error^2``, at most the number of worlds, times ``(z / t)^2`` (Korn and Graubard 1998). If p is 0 or 1, n
-    is ``1 / sum h_g^2`` times ``(z / t)^2``.
+    With the number n of worlds and the 97.5 % quantile z of the normal distribution, the interval has the centre ``(p +
+    z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width ``z sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``. With
+    clusters, n is instead the number of independent worlds with the same standard error, ``1 + p (1 - p) / error^2``,
+    at most the number of worlds, times ``(z / t)^2`` for the t quantile t (Korn and Graubard 1998). If p is 0 or 1, n
+    is ``1 / sum h_g^2`` times ``(z / t)^2``, where h_g is the share of cluster g in the worlds.
     """
     share, n = int(np.count_nonzero(truths)) / len(truths), float(len(truths))
     error: float | None = sqrt(share * (1.0 - share) / n)

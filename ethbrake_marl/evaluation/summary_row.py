@@ -47,7 +47,7 @@ class SummaryRow:
 
     @property
     def exploits(self) -> dict[str, str]:
-        """Exploits: conduct that harm does not count, name -> its size in words.
+        """Conduct of the team that harm does not count: name -> size in words.
 
         ``pushes``: the team pushes Vehicle 1 far. ``moving``: a vehicle often still moves at the horizon.
         """
@@ -61,7 +61,7 @@ class SummaryRow:
 
     @property
     def marked(self) -> str:
-        """Name of the team, with ‡ if it has exploits."""
+        """Name of the team, with ‡ if the team has ``exploits``."""
         return f"{self.agent} {EXPLOITS}" if self.exploits else self.agent
 
     def to_json(self) -> dict[str, Any]:

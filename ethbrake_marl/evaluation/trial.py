@@ -19,7 +19,7 @@ COMPARED = {"full braking": "full_brake", "best constant deceleration": "e_v2x_b
 
 
 class Trial(NamedTuple):
-    """What happens in the first worlds of the evaluation list if all learners brake fully."""
+    """What happens in the first worlds of the evaluation list. All learners brake fully, except in ``harm``."""
 
     drawn: DrawnWorlds
     early: int  # worlds with an impact before a learner can act
@@ -31,7 +31,7 @@ class Trial(NamedTuple):
 
 
 def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
-    """Simulate the first 200 worlds of the evaluation list, once with each agent of ``COMPARED`` as the learners.
+    """Simulate the first 200 worlds of the evaluation list, once with each agent in ``COMPARED`` driving the learners.
 
     ``count`` is the harm that ``best constant deceleration`` and ``best known`` minimise. Raises the errors of scripts,
     which name vehicle, world and time.

@@ -212,12 +212,12 @@ class EthBrakeVecEnv(Face, VecEnv):
         return np.concatenate([rows, more], axis=1, dtype=np.float32)
 
     def snapshot(self) -> dict[str, Any]:
-        """Everything that ``restore`` needs to continue from here, as arrays and numbers."""
+        """Everything that ``restore`` needs to continue from the present state, as arrays and numbers."""
         stream = [self.stream.seed, self.stream.next]
         return copy.deepcopy({"stream": stream, **{name: getattr(self, name) for name in SAVED}})
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Continue from a ``snapshot``. It can be restored several times."""
+        """Continue from a ``snapshot``. The same snapshot can be restored several times."""
         saved = copy.deepcopy(saved)
         seed, following = saved["stream"]
         self.stream = self.stream._replace(seed=seed, next=following)

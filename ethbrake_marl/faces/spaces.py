@@ -26,7 +26,7 @@ def feature_box(features: Sequence[Feature]) -> Box:
 
 
 def reward_box(components: Sequence[Any]) -> Box:
-    """Space of vector rewards: float64, so a weighted sum equals the scalar reward to the last bit."""
+    """Space of vector rewards, [components]; float64, so a weighted sum equals the scalar reward to the last bit."""
     return Box(-np.inf, np.inf, (len(components),), np.float64)
 
 
@@ -46,8 +46,9 @@ def action_space(count: int | None) -> Any:
 def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, count: int | None = None) -> Floats:
     """Actions as a float64 array of ``shape``. The input may have more or fewer axes of length 1.
 
-    Index k of ``count`` stands for ``(2 k - count + 1) / (count - 1)``. Raises ``InvalidInput`` for a wrong shape or
-    index, and for values that are not numbers. The range [-1, 1] is checked later, in ``Game.step``.
+    With ``count`` the input consists of indices: index k stands for the action ``(2 k - count + 1) / (count - 1)``.
+    ``whose``: who acts, in messages. Raises ``InvalidInput`` for a wrong shape or index, and for values that are not
+    numbers. The range [-1, 1] is checked later, in ``Game.step``.
     """
     try:
         numbers = np.asarray(actions)

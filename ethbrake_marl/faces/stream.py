@@ -28,7 +28,7 @@ class UnknownResetOption(UserWarning):
 class Stream(NamedTuple):
     """The training worlds of a seed, one after the other. World k of a seed is the same in every row.
 
-    A stream never changes. A method that begins episodes also returns a new stream, of the worlds that follow.
+    A stream never changes. A method that begins episodes also returns a new stream, which continues after their worlds.
     """
 
     scenario: Scenario
@@ -40,9 +40,9 @@ class Stream(NamedTuple):
     )
 
     def reset(self, n: int, seed: Any, options: Any = None) -> tuple[Stream, State]:
-        """Stream of the worlds that follow, and new episodes in the first n worlds of a seed.
+        """Stream for later episodes, and new episodes in the first n worlds of a seed.
 
-        Without a seed the next n worlds begin; the first reset without a seed draws a random one. With a list of n
+        Without a seed the next n worlds begin; the first reset without a seed draws a random seed. With a list of n
         seeds each row begins with the first world of its own seed. ``options`` may specify the worlds instead. Raises
         ``InvalidInput`` for a bad seed or option; warns of unknown options.
         """
@@ -60,7 +60,7 @@ class Stream(NamedTuple):
         return self._replace(seed=chosen, next=after, option_worlds=option_worlds), self.game.reset(worlds)
 
     def next_episodes(self, rows: Ints) -> tuple[Stream, State]:
-        """Stream of the worlds that follow, and a new episode for each of ``rows``, in its next world.
+        """Stream for later episodes, and a new episode in the next world for each of ``rows``.
 
         The new episodes share no arrays with others.
         """

@@ -74,7 +74,7 @@ def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
 
 
 class Wording:
-    """Parts of error messages for one kind of file, which subclasses override. An empty text is left out."""
+    """Parts of error messages about one kind of file. Subclasses override them. An empty text is left out."""
 
     def __init__(self, model: type[FileModel], needed: str = "") -> None:
         self.model, self._needed = model, needed
@@ -106,7 +106,7 @@ class Wording:
 
 
 def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
-    """Error to raise: for the first unknown key, or without one for the first mistake that pydantic reports."""
+    """Error to raise for ``error``: about the first unknown key, or else the first mistake that pydantic reports."""
     # A default that depends on an invalid field is no mistake of its own.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
     detail = next((d for d in details if d["type"] == "extra_forbidden"), details[0])

@@ -13,7 +13,7 @@ from ethbrake_marl.files.yaml import flow_text, parse_yaml
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """A setting such as ``reward.harm=0.5``, as a path and a value."""
+    """A setting such as ``reward.harm=0.5``, split into a path of keys and a value."""
 
     text: str  # the setting as written
     path: tuple[str, ...]  # keys that lead to the value, the outermost first; indices (from 0) inside lists

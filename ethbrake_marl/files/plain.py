@@ -40,7 +40,7 @@ def open_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> Iterator[BufferedReader]:
-    """Open a plain file of at most ``limit_bytes``.
+    """Open a plain file (no folder, pipe or device) of at most ``limit_bytes``.
 
     Kind and size are checked first, so pipes and devices are never opened. Raises ``refusal`` with path and reason if
     the file does not exist, is not plain, is a symbolic link (unless ``follow_links``), is too large or cannot be

@@ -223,7 +223,7 @@ class Sheet:
         return column_count, {name: f"[{number}]" for number, name in enumerate(long, 1)}
 
     def json(self) -> list[dict[str, Any]]:
-        """One mapping per row, column name -> cell, without sections. An interval has an entry of its own."""
+        """One mapping per row, column name -> cell, without names of sections. An interval has an entry of its own."""
         rows = []
         for row in self.rows:
             if not isinstance(row, str):

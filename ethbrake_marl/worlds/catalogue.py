@@ -93,8 +93,8 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
     """Path of a scenario's file.
 
     A text that ends in ``.yaml`` or ``.yml`` is a path relative to ``folder``; the file need not exist. Any other text
-    is the name of a shipped or registered scenario, or else the path of an existing file without its ending. Raises
-    ``UnknownName`` if it is neither.
+    is the name of a shipped or registered scenario. If there is no such scenario, the text is the path of an existing
+    file, without the ending. Raises ``UnknownName`` if there is no such file either.
     """
     text, paths = str(name_or_path), _known_paths()
     path = folder / Path(text).expanduser()

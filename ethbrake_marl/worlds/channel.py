@@ -102,7 +102,7 @@ class Extension:
     keys: type[ScenarioPart]  # its keys of ``v2x``, with types and descriptions; none is required
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Keys in ``OF_MESSAGES`` that have an effect with this extension. A key without any effect is refused."""
+        """Keys of messages (``OF_MESSAGES``) that this extension needs even if ``link_latency_s`` fixes all delays."""
         return ()
 
     def is_random(self, v2x: V2X) -> bool:
@@ -120,7 +120,7 @@ class Extension:
         """
 
     def layer(self, v2x: V2X) -> Layer:
-        """The layer through which vehicles see the state."""
+        """Layer that changes what vehicles know of the state (``episode.layer``)."""
         raise NotImplementedError
 
 
@@ -256,7 +256,9 @@ class V2X(ScenarioPart):
 
     @property
     def extensions(self) -> tuple[Extension, ...]:
-        """Extensions that the keys switch on, sorted by name, so that the order of the keys has no effect."""
+        """Extensions that the keys of ``v2x`` switch on. They are sorted by name, so the order of the keys has no
+        effect.
+        """
         extensions = {EXTENSIONS[key] for key in self.model_extra or ()}
         return tuple(sorted(extensions, key=lambda extension: extension.name))
 
@@ -269,12 +271,15 @@ class V2X(ScenarioPart):
 
     @property
     def by_link(self) -> bool:
-        """Whether links matter. In the paper's channel they do not: a vehicle knows all after its own latency."""
+        """Whether single links (from one sender to one receiver) matter.
+
+        In the paper's channel they do not: a vehicle knows everything as soon as its own latency is over.
+        """
         return self.timing != "latency" or (self.hears, self.senses, self.lost) != ("all", "none", 0.0)
 
     @property
     def drawn(self) -> bool:
-        """Whether random numbers decide what vehicles know, or when."""
+        """Whether random numbers decide what vehicles know of each other, or from when on."""
         random_messages = self.hears != "none" and (self.timing == "messages" or 0.0 < self.lost < 1.0)
         random_sensing = self.senses != "none" and self.sensing_s[0] != self.sensing_s[1]
         random_extensions = any(extension.is_random(self) for extension in self.extensions)
@@ -294,10 +299,10 @@ class V2X(ScenarioPart):
         return delay
 
     def heard_and_seen(self, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
-        """Time from which vehicle i can use messages of vehicle j, and delay until i sees j, [n, N (i), N (j)] s each.
+        """Time of the first message from vehicle j to i, and delay until i sees j, [n, N (i), N (j)] s each.
 
-        ``u`` [n, PER_LINK N^2]: uniform numbers of the links. ``unheard`` [n or 1, N, N]: whether the vehicles'
-        equipment excludes the link (``Scenario.unheard``). Infinite: never. Minus infinite: at once.
+        ``u`` [n, PER_LINK N^2]: uniform numbers, PER_LINK for each link. ``unheard`` [n or 1, N, N]: whether the
+        vehicles' equipment excludes the link (``Scenario.unheard``). Infinite: never. Minus infinite: at once.
         """
         N = unheard.shape[1]
         links, (receiver, sender) = u.reshape(len(u), N, N, PER_LINK), np.indices((N, N))
@@ -309,7 +314,7 @@ class V2X(ScenarioPart):
         return message_time, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
 
     def news(self, own_latency: Floats, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
-        """Time from which each vehicle can react, [n, N] s, and from which vehicle i reacts to vehicle j, [n, N, N] s.
+        """Times from which each vehicle can react, [n, N] s, and from which vehicle i reacts to vehicle j, [n, N, N] s.
 
         ``own_latency`` [n, N] (s): latencies without the wait for messages. ``u``, ``unheard``: as in
         ``heard_and_seen``.

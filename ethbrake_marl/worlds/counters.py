@@ -22,7 +22,7 @@ _PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
 
 def world_numbers(n: int, seed: int, first: int, purpose: str) -> Ints:
-    """Numbers of n worlds, ``first`` to ``first + n - 1``, [n]. Raises ``InvalidInput`` for a bad argument."""
+    """Numbers ``first`` to ``first + n - 1`` of n worlds, [n]. Raises ``InvalidInput`` for a bad argument."""
     check_whole_number("number of worlds", n, 1, MOST_AT_ONCE)
     check_whole_number("seed of the list", seed, 0)
     check_whole_number("first world", first, 0, _MOST_WORLDS)
@@ -34,10 +34,10 @@ def world_numbers(n: int, seed: int, first: int, purpose: str) -> Ints:
 def uniform_numbers(seed: int, purpose: str, attempt: int, index: Ints) -> Numbers:
     """Source of random numbers for the worlds with the numbers ``index`` [n], in ascending order.
 
-    It is a function ``(width, stream)`` -> uniform numbers in [0, 1), [n, width]. ``stream`` names an independent
-    sequence of random numbers; ``attempt`` counts, from 0, how often the worlds have been drawn again. A random number
-    is the upper 53 bits of an integer from Philox, divided by 2^53. The key of Philox comes from seed, purpose, attempt
-    and stream; world k has the counters from ``k width / 4`` on. A width is a multiple of 4.
+    The source is a function ``(width, stream)`` -> uniform numbers in [0, 1), [n, width]. ``stream`` names an
+    independent sequence of random numbers; ``attempt`` counts, from 0, how often the worlds have been drawn again. A
+    random number is the upper 53 bits of an integer from Philox, divided by 2^53. The key of Philox comes from seed,
+    purpose, attempt and stream; world k has the counters from ``k width / 4`` on. A width is a multiple of 4.
     """
     first, count = int(index[0]), int(index[-1]) - int(index[0]) + 1
 

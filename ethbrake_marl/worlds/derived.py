@@ -29,10 +29,10 @@ def world_values(
     """All quantities of k worlds except the distance of the obstacle: key -> [k, entries].
 
     There is an entry for each vehicle or pair, or one for the world. ``declared(key)`` returns the drawn values of a
-    declared quantity, [k, entries]; ``settle(key, values)`` may replace the values of a quantity before others are
-    computed from it: ``speed = line speed + own deviation``, ``gap = time gap x speed of the rear vehicle``, ``latency
-    = own latency + time of the alert``. These increase with the declared quantities, so bounds of the declared
-    quantities give bounds of the results. Friction limits capacities to friction x gravity.
+    declared quantity, [k, entries]. Other quantities follow: ``speed = line speed + own deviation``, ``latency = own
+    latency + time of the alert``, ``gap = time gap x speed of the rear vehicle``. Friction limits capacities to
+    friction x gravity. ``settle(key, values)`` may replace the values of a quantity before they enter gaps and limits.
+    No result decreases if a declared quantity increases, so bounds of declared quantities give bounds of the results.
     """
     keys = [key for key in (*USUAL, *OPTIONAL) if key != "obstacle_gap_m" and key in scenario.sources]
     values = {key: declared(key) for key in keys}
@@ -50,11 +50,12 @@ def world_values(
 
 
 def obstacle_gap(scenario: Scenario, values: QuantityValues, declared: Callable[[str], Floats]) -> Floats:
-    """Distance from Vehicle 1 to the obstacle, [k, 1] m, in a scenario with an obstacle.
+    """Distance from Vehicle 1 to the obstacle, [k, 1] m, in k worlds of a scenario with an obstacle.
 
-    The scenario declares this distance, or a margin: the distance that is left after full braking. With a margin it is
-    ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``, from speed, latency and braking capacity of Vehicle 1, or longer if brakes
-    build up (``motion.forces.stopping_m``).
+    The scenario declares this distance, or a margin: the distance that is left after full braking. With a margin the
+    distance is ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``, with speed v_1, latency tau_1 and braking capacity a_1 of
+    Vehicle 1. It is longer if brakes build up (``motion.forces.stopping_m``). ``values``: result of ``world_values``;
+    ``declared``: as there.
     """
     if "obstacle_gap_m" in scenario.sources:
         return declared("obstacle_gap_m")
@@ -67,8 +68,8 @@ def obstacle_gap(scenario: Scenario, values: QuantityValues, declared: Callable[
 def mistakes(scenario: Scenario, low: QuantityValues, high: QuantityValues) -> Iterator[tuple[str, int, int, str]]:
     """Contradictions in k worlds whose quantities lie between ``low`` and ``high`` (key -> [k, entries] each).
 
-    Yields for each contradiction the quantity's key (``v2x``: the channel), the vehicle's index from 0, the row of the
-    first world that has it, and what would be right.
+    Each contradiction consists of the quantity's key (``v2x`` if messages are the reason), the vehicle's index from 0,
+    the first world with the contradiction (row of ``low``), and what would be right.
     """
 
     def first(holds: Any) -> Any:

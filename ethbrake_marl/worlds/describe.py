@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def columns_of(drawn_worlds: DrawnWorlds) -> dict[str, NDArray[np.generic]]:
-    """Table of drawn worlds, column -> [n]: ``world`` (its number) and columns of ``kinds_of``, ``quantities_of``."""
+    """Table of drawn worlds, column -> [n]: the number ``world``, and columns of ``kinds_of`` and ``quantities_of``."""
     numbers = drawn_worlds.worlds.clock[:, NUMBER].astype(np.int64)
     return {"world": numbers, **kinds_of(drawn_worlds), **quantities_of(drawn_worlds.worlds, drawn_worlds.friction)}
 
@@ -27,8 +27,8 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
     """Quantities of worlds at the alert, column -> [n], as ``worlds_from_table`` reads them.
 
     Capacities include the limit that the road's ``friction`` [n] sets. There is a column of the friction if every world
-    has one; columns of the obstacle, the brakes' rates and the weights of harm if some world has them. A world without
-    obstacle has NaN there; an infinite rate becomes the largest valid number.
+    has one; columns of the obstacle, the brakes' rates and the weights of harm if some world has them. The distance to
+    an obstacle is NaN in a world without one. An infinite rate becomes the largest valid number.
     """
     values = {"gaps_m": worlds.gaps_m, "speeds_mps": worlds.speeds_mps}
     values |= {key: worlds.car[:, row, 1:] for key, row in CAR_QUANTITIES.items()}
@@ -71,8 +71,8 @@ def kinds_of(drawn_worlds: DrawnWorlds) -> dict[str, Texts]:
 def clusters_of(columns: Mapping[str, NDArray[Any]]) -> Texts | None:
     """Name of the cluster to which each world belongs, [n]; None if all worlds are independent.
 
-    Worlds of one recording depend on each other. The column ``recording`` names the recording before its last ": ". A
-    world without a recording is a cluster by itself.
+    Worlds of one recording depend on each other and form a cluster. The text before the last ": " in the column
+    ``recording`` is the name of the recording. A world without a recording is a cluster by itself.
     """
     if RECORDING not in columns:
         return None

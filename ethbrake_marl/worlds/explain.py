@@ -103,7 +103,7 @@ def check_file_name(kind: str, name: str) -> None:
 
 
 def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path = Path()) -> str:
-    """Text of a new scenario file in ``folder``, based on ``based_on``, whose values stand in comments."""
+    """Text of a new scenario file in ``folder``, based on ``based_on``. Comments list the values of that scenario."""
     check_file_name("scenario", name)
     base = load_scenario(based_on)
     values, path = base.declared(), scenario_path(based_on)
@@ -119,7 +119,7 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path
 
 
 def whole_text(scenario: str | Path) -> str:
-    """Text of a scenario's file; or a text with all its values, if it is based on another scenario."""
+    """Text of a scenario's file. If the scenario is based on another one: a text with all values of the scenario."""
     path, loaded = scenario_path(scenario), load_scenario(scenario)
     text = read_plain(path, YAML_SIZE_LIMIT).decode("utf-8")
     if "based_on" not in parse_yaml(text).content:

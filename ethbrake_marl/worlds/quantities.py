@@ -218,5 +218,8 @@ def check_length(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
 
 
 def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, QuantityEntry]:
-    """Columns of a table with these quantities: name -> (key, index from 0), such as ``{"gap_1_m": ("gaps_m", 0)}``."""
+    """Columns of a table with these quantities: name -> (key, index of the vehicle or pair from 0).
+
+    An example is ``{"gap_1_m": ("gaps_m", 0)}``.
+    """
     return {QUANTITIES[key].column_of(i): (key, i) for key in keys for i in range(QUANTITIES[key].count(vehicles))}

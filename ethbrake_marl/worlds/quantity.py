@@ -34,7 +34,7 @@ PositiveEnds = Annotated[tuple[PositiveNumber, PositiveNumber], Field(strict=Fal
 
 
 def pick(weights: Sequence[float] | Floats, u: Floats) -> Ints:
-    """For each number in ``u``, index of the first weight whose cumulative share of all ``weights`` is above it."""
+    """Index that each uniform number in ``u`` chooses: the first k with ``sum(weights[: k + 1]) > u sum(weights)``."""
     cumulative = np.cumsum(np.asarray(weights, np.float64))
     return np.searchsorted(cumulative / cumulative[-1], u, side="right")
 
@@ -50,7 +50,10 @@ class ScenarioPart(FileModel):
 
 
 class Distribution(ScenarioPart):
-    """Base class of distributions. The first field of a subclass is the distribution's name; its value is the shape."""
+    """Base class of distributions.
+
+    The first field of a subclass has the distribution's name and holds the parameters.
+    """
 
     @property
     def support(self) -> tuple[float, float]:
@@ -59,18 +62,18 @@ class Distribution(ScenarioPart):
 
 
 class Uniform(Distribution):
-    """``{uniform: [low, high]}``: ``low + (high - low) u``."""
+    """``{uniform: [low, high]}``: ``low + (high - low) u``, u uniform in [0, 1)."""
 
     uniform: Ends = Field(description="[low, high]")
 
     def value(self, u: Floats) -> Floats:
-        """Value in [low, high]: it is never above high, because u is at most 1 - 2^-53."""
+        """Values for the uniform numbers ``u``, [n]. None is above high, because u is at most 1 - 2^-53."""
         low, high = self.uniform
         return low + (high - low) * u
 
 
 class LogUniform(Distribution):
-    """``{loguniform: [low, high]}``: ``low (high / low)^u``, so 1 to 2 is as likely as 2 to 4."""
+    """``{loguniform: [low, high]}``: ``low (high / low)^u``, u uniform in [0, 1), so 1 to 2 is as likely as 2 to 4."""
 
     loguniform: PositiveEnds = Field(description="[low, high], both above 0")
 
@@ -98,7 +101,9 @@ class NormalShape(ScenarioPart):
         return low, high
 
     def value(self, u: Floats) -> Floats:
-        """``mean + sd Q(p_low + (p_high - p_low) u)`` with the standard normal quantile function Q."""
+        """``mean + sd Q(p_low + (p_high - p_low) u)`` with the standard normal quantile function Q and the ``shares``
+        p.
+        """
         below, above = self.shares()
         return np.clip(self.mean + self.sd * normal_quantile_each(below + (above - below) * u), self.low, self.high)
 

@@ -62,7 +62,7 @@ class DrawnWorlds(NamedTuple):
 def draw_worlds(scenario: Scenario, n: int, seed: int, first: int, purpose: Purpose) -> DrawnWorlds:
     """Worlds ``first`` to ``first + n - 1`` of the seed's endless list.
 
-    Raises ``InvalidInput`` for bad arguments, and for a world that is rejected ``MOST_ATTEMPTS`` times.
+    Raises ``InvalidInput`` for bad arguments, and for a world that has an early impact in ``MOST_ATTEMPTS`` draws.
     """
     index = world_numbers(n, seed, first, purpose)
     if not scenario.members:
@@ -86,7 +86,7 @@ def member_numbers(scenario: Scenario, index: Ints, seed: int, purpose: Purpose 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> DrawnWorlds:
     """The worlds ``index`` [n] of a scenario without mixture, drawn from the random ``numbers``.
 
-    A world with an early impact is not drawn again.
+    A world with an early impact (``has_early_impact``) is not drawn again.
     """
     n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.columns.get(RECORDING)
     numbers, kind, load = cache(numbers), np.zeros((n, N), np.int64), np.zeros((n, N))
@@ -189,7 +189,7 @@ def _draw_accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> 
 
 
 def has_early_impact(scenario: Scenario, alert: State) -> Bools:
-    """Whether an impact happens before or just when the first learner can act, [n]. Nobody can prevent it."""
+    """Whether an impact happens before or just when the first learner can act, so that nobody can prevent it, [n]."""
     deciders = np.array(scenario.learners, np.int64)
     state = first_decision(alert, deciders, StepSettings(deciders, scenario.time_step_s, scenario.horizon_s))
     return np.asarray(state.line[:, IMPACTS].any(axis=1))

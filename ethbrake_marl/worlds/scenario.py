@@ -241,14 +241,17 @@ class Scenario(ScenarioPart):
         return self.draw(n, seed, first=first, purpose=purpose).worlds
 
     def draw(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> DrawnWorlds:
-        """Worlds as in ``sample``, with frictions, vehicle types, members, recordings and number of rejected draws."""
+        """The worlds of ``sample``, with the friction, vehicle types, member of the mixture and recording of each.
+
+        The result also contains the number of rejected draws.
+        """
         return draw_worlds(self, n, seed, first, purpose)
 
     # ---- who is in the line
 
     @property
     def members(self) -> tuple[Scenario, ...]:
-        """Scenarios of a mixture, with the keys that stand next to ``mixture``; empty if this is not a mixture."""
+        """Scenarios of a mixture, each with the keys that stand next to ``mixture``; empty if this is no mixture."""
         return tuple(entry.scenario for entry in self.mixture or ())
 
     @cached_property
@@ -270,7 +273,8 @@ class Scenario(ScenarioPart):
     def unheard(self, types: Ints | None = None) -> Bools:
         """Whether vehicle i cannot get messages of vehicle j because of their types' V2X equipment, [n, N (i), N (j)].
 
-        ``types`` [n, N]: number of each vehicle's type. None: whether some of the possible types prevent it, [1, N, N].
+        ``types`` [n, N]: number of each vehicle's type. None: whether some possible types of i and j exclude messages,
+        [1, N, N].
         """
         if self.types_of_line is None:
             return np.zeros((1, self.vehicles, self.vehicles), np.bool_)
@@ -290,10 +294,10 @@ class Scenario(ScenarioPart):
 
     @cached_property
     def sources(self) -> dict[str, list[dict[int, Any]]]:
-        """Where the values of each declared quantity come from: key -> entries of vehicles or pairs, or of the world.
+        """Sources of the values of each declared quantity: key -> entries, one per vehicle or pair, or one per world.
 
-        An entry maps numbers of vehicle types (0 without types) to a number, a distribution or a column of the table:
-        ``sources["mass_t"]`` may be ``[{0: 2.0, 1: 9.5}, ...]``.
+        An entry maps the number of each possible vehicle type (0 without types) to the source: a constant, a
+        distribution or a column of the table. ``sources["mass_t"]`` may be ``[{0: 2.0, 1: 9.5}, ...]``.
         """
         sources = {}
         for key, rule in QUANTITIES.items():
@@ -314,7 +318,8 @@ class Scenario(ScenarioPart):
     def bounds(self, key: str) -> tuple[tuple[float, float], ...]:
         """Smallest and largest value of a quantity, for each vehicle or pair, or once for the world.
 
-        Capacities include the limit that the road's friction sets. An undeclared brake rate is the largest valid one.
+        Capacities include the limit that the road's friction sets. An undeclared rate of the brakes counts as the
+        largest valid rate.
         """
         at_once = np.full((2, self.vehicles), QUANTITIES[key].high)
         member_bounds = [world_values(member, member.ends).get(key, at_once) for member in self.members or (self,)]
@@ -322,7 +327,10 @@ class Scenario(ScenarioPart):
         return tuple(zip(lows.tolist(), highs.tolist(), strict=True))
 
     def ends(self, key: str) -> Floats:
-        """Smallest and largest value of a declared quantity, [2, entries]: of each vehicle or pair, or of the world."""
+        """Smallest and largest value of a declared quantity, [2, entries].
+
+        There is one entry for each vehicle or pair, or one for the world.
+        """
         supports = [np.array([support(quantity) for quantity in entry.values()]) for entry in self.sources[key]]
         return np.array([(ends[:, 0].min(), ends[:, 1].max()) for ends in supports]).T
 
@@ -333,7 +341,9 @@ class Scenario(ScenarioPart):
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
     def content(self, without: Sequence[str] = ()) -> dict[str, Any]:
-        """All values as plain data, with defaults, but without the keys ``without`` and the members' titles."""
+        """All values as plain data, with defaults, but without the keys ``without`` and the titles of a mixture's
+        members.
+        """
         without_words: dict[str, Any] = {"mixture": {"__all__": {"scenario": {*DESCRIPTIVE_KEYS}}}}
         return self.model_dump(mode="json", exclude=without_words | dict.fromkeys(without, True))
 
@@ -357,9 +367,9 @@ class Scenario(ScenarioPart):
 
 
 def plain(value: Any) -> Any:
-    """The value as plain dictionaries, lists, numbers and texts.
+    """``value`` as plain dictionaries, lists, numbers and texts.
 
-    It may be a mapping, sequence, array, pydantic model, ``View``, path or enumeration.
+    ``value`` may be a mapping, sequence, array, pydantic model, ``View``, path or enumeration.
     """
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_unset=True, exclude_none=True)

@@ -126,7 +126,7 @@ class CsvFile(NamedTuple):
         return cls(path, [name.strip() for name in rows.pop(first)], rows)
 
     def cells(self, columns: Sequence[str]) -> list[list[float | str]]:
-        """Cells of each row in ``columns``: numbers, but texts in the column ``recording``.
+        """Cells of ``columns``, row by row: numbers, but texts in the column ``recording``.
 
         Raises ``InvalidInput`` for a row of another length than the header, and for a text that is not a number.
         """
@@ -145,7 +145,7 @@ class CsvFile(NamedTuple):
 
 
 def read_rows(path: Path, columns: object) -> list[list[float | str]]:
-    """Cells of a CSV file in ``columns``, the list of names in the key ``table`` of a scenario.
+    """Cells of ``columns`` of a CSV file, row by row. ``columns``: the value of this key in a scenario's ``table``.
 
     Ranges are not checked. Raises ``InvalidInput`` for a column that is missing or occurs twice.
     """

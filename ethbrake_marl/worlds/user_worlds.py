@@ -50,8 +50,8 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     """Worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
 
     ``columns`` may also be a pandas or polars data frame, a pyarrow table or a structured array of numpy; rows are
-    matched by position. Columns of ``world_columns`` that are missing take the scenario's value, which must be fixed.
-    Raises ``InvalidInput``, with column and row (from 0), for a bad value.
+    matched by position. A missing column (of ``world_columns``) takes the scenario's value, which must be fixed. Raises
+    ``InvalidInput``, with column and row (from 0), for a bad value.
     """
     scenario, where = load_scenario(scenario), "initial states"
     columns = columns.collect() if callable(getattr(columns, "collect", None)) else columns  # a LazyFrame of polars
@@ -99,7 +99,7 @@ def world_keys(scenario: Scenario) -> tuple[str, ...]:
 
 
 def world_columns(scenario: Scenario) -> dict[str, QuantityEntry]:
-    """Columns that a table of worlds of this scenario may have: name -> (key, index from 0)."""
+    """Columns that a table of worlds may have: name -> (key of the quantity, index of the vehicle or pair, from 0)."""
     return table_columns(world_keys(scenario), scenario.vehicles)
 
 

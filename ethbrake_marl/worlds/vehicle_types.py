@@ -66,7 +66,7 @@ def _type_quantity(key: str) -> Any:
 class VehicleType(ScenarioPart):
     """Masses, capacities, latencies and more of one kind of vehicle.
 
-    The scenario declares outside ``vehicle_types`` the quantities that a type does not declare.
+    If a type does not declare a quantity, the scenario's key outside ``vehicle_types`` applies.
     """
 
     weight: Weight = Field(default=1.0, description="how likely this type is, relative to the other types")
