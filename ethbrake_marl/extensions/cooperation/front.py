@@ -200,8 +200,8 @@ class Drivers(NamedTuple):
     def of(scenario: Scenario, weights: Floats, names: Sequence[str], count: str) -> Drivers:
         """Learners of ``scenario``, with the agents ``names`` for each row of ``weights`` [W, N].
 
-        With several learners, each of them alone is included, with the agents that can drive it. ``count``: the harm
-        that agents minimise.
+        With several learners, ``alone`` contains each of them, with the agents that can drive it. ``count``: count of
+        harm that agents minimise.
         """
         chosen = [scenario.replace(harm_weight=row.tolist(), objective="preference") for row in weights]
         teams = [make_teams(names, variant, harm_count=count) for variant in chosen]

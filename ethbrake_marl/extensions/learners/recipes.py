@@ -36,7 +36,7 @@ class Range(FileModel):
 
 
 class BranchingRecipe(TrainingRecipe):
-    """Keys of both algorithms, which try actions at visited decisions and simulate each branch to its end."""
+    """Keys of vine and rollout classification, which try actions at visited decisions and simulate to the end."""
 
     n_steps: int = Field(ge=1, description="number of decisions in each world between two updates")
     tried: int = Field(ge=1, description="number of decisions per update at which other actions are tried")
