@@ -221,9 +221,9 @@ class MedianLine(NamedTuple):
         """Median lines in which received values replace assumed ones; ``state`` is the true state now.
 
         A received place and speed are extrapolated to the present by the sender's script, without contact. A sender
-        that was not accelerating is taken to react no earlier than at the time of its sample. A vehicle with an unknown
-        place keeps its distance to this vehicle, as far as the order of the line allows. This vehicle's own motion and
-        impacts are measured.
+        that was not accelerating is assumed to react no earlier than at the time of its sample. A vehicle with an
+        unknown place keeps its distance to this vehicle, as far as the order of the line allows. This vehicle's own
+        motion and impacts are measured.
         """
         body, news = self.body, self.received(state)
         line, car = median.line.copy(), median.car.copy()

@@ -301,7 +301,7 @@ class ProfilePool:
     def choice(self, weights: Floats) -> Ints:
         """Number of the profile with the least weighted harm in each world, [n].
 
-        Among equal profiles, the one with the least total over the vehicles. ``weights`` [N].
+        Among equal profiles, it has the least total harm of all vehicles. ``weights`` [N].
         """
         borne = np.stack(self.borne[self.count])
         amounts = weighted_harm(borne, weights)

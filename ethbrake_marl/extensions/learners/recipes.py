@@ -98,8 +98,8 @@ class ChoosingShape(FileModel):
 class RolloutClassificationRecipe(BranchingRecipe):
     """Recipe of rollout classification: several choices are tried at a decision, and the network learns the cheapest.
 
-    A choice is one of ``network.choices`` actions. Tried are the policy's own choice, an action below and one above it
-    for each range of ``near``, the ``fixed`` actions, and ``drawn`` others.
+    A choice is one of ``network.choices`` actions. The tried choices are the policy's choice, one below and one above
+    it for each range of ``near``, the ``fixed`` actions, and ``drawn`` others.
     The *cost* of a choice is minus the return from the decision to the end of the episode.
     """
 

@@ -47,7 +47,7 @@ class ClippedActor(AveragedNetwork):
 
 
 class Branches(NamedTuple):
-    """Two branches of each of B visited decisions: first B with a higher action, then B with a lower one."""
+    """Two simulated branches of each of B visited decisions: first B with a higher action, then B with a lower one."""
 
     world: Ints  # [2B] number of the visited state
     learner: Ints  # [2B] learner whose action is moved, from 0

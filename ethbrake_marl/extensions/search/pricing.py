@@ -329,7 +329,7 @@ def beside_braking(problem: Problem, single_problem: Problem, profiles: Profiles
 def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
     """Hash of everything that decides the harm of a profile, [n]: 8 bytes of BLAKE2b of each world.
 
-    Hashed are the world, the commands of all other vehicles, which vehicles are controlled (``bodies``), and ``times``
+    The hash covers the world, the controlled vehicles (``bodies``), the commands of all other vehicles, and ``times``
     [n, 4]: first decision, time step, number of steps, end.
     """
     line, car, digests = alert.line, alert.car, np.empty(alert.n, np.uint64)

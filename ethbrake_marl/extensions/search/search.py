@@ -174,7 +174,7 @@ def halve_phases(field: Field, attention: int) -> None:
 
 
 def select(world: World, room: Room, starts: Profiles, field: Field) -> None:
-    """Put the best profile of ``field`` and ``starts`` at index 0 of ``field``; let ``world`` simulate step by step."""
+    """Put the best of ``field`` and ``starts`` at index 0 of ``field``. Then ``world`` is simulated step by step."""
     world.numbers[STEPWISE] = 1.0
     best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
     gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
