@@ -57,7 +57,7 @@ def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
 
 @large
 def squash(values: Float32s) -> None:
-    """Replace every entry of ``values`` [k, rows] by its tanh, with an error of about half a unit in the last place.
+    """Replace ``values`` [outputs, rows] by their tanh, with an error of about half a unit in the last place.
 
     ``tanh(a) = 1 - 2 / (e^(2 a) + 1)``
     """

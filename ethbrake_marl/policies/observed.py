@@ -85,10 +85,10 @@ class ObservationSchema(FiniteModel):
         )  # fmt: skip
 
     def check(self, where: Path, version: str) -> None:
-        """Raise an error unless every feature is the same as in training. ``version``: of this package in training.
+        """Raise an error unless every feature is the same as in training.
 
-        ``InvalidInput``: a user's feature is missing or has changed. ``CorruptBundle``: a feature of this package has
-        changed.
+        ``version``: version of this package in training. Raises ``InvalidInput`` if a user's feature is missing or has
+        changed, and ``CorruptBundle`` if a feature of this package has changed.
         """
         for old in self.registered:
             observes = f"{where}: the policy observes the feature {old.name!r:.80}"

@@ -32,7 +32,7 @@ class Algorithm(ABC):
         """
 
     def actors(self, model: BaseAlgorithm) -> list[Any]:
-        """Policies that choose actions, one for each of ``training.groups``."""
+        """Policies that choose actions, one for each group of learners (``Training.groups``)."""
         return [model.policy]
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:

@@ -130,7 +130,7 @@ def run_experiment(
 def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: OnProgress) -> list[str]:
     """Names for which ``use`` raises no ``InvalidInput``. ``tell`` is called with the error of every other name.
 
-    ``what``: what the names stand for, in words. An error of full braking is raised.
+    ``what``: what is tried, for these reports, such as ``baselines``. The error of ``full_brake`` is raised.
     """
     usable_names = []
     for number, name in enumerate(names):

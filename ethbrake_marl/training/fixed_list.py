@@ -65,5 +65,5 @@ def exact_mean(values: Floats) -> float:
 
 
 def deciding(metrics: Mapping[str, float], harm_count: str) -> float:
-    """The metric by which a training picks its best policy, the one with the lowest value; NaN if not measured."""
+    """Metric by which a training picks its best policy: the lowest value is best. NaN if not measured."""
     return metrics.get(OBJECTIVE_METRIC, metrics.get(COLUMN[harm_count], np.nan))

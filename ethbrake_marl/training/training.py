@@ -70,7 +70,7 @@ class Training(NamedTuple):
 
     @property
     def row(self) -> View:
-        """Features in the environment's observations: all features that some learner observes."""
+        """Features in the environment's observations: all features that at least one learner observes."""
         return View(list(dict.fromkeys(name for view in self.views for name in view.names)))
 
     @property

@@ -102,7 +102,7 @@ class News(NamedTuple):
         """Speeds (m/s) at ``time_s`` [n, 1], and ways (m) driven since the newest samples, [n, N + 1] each.
 
         Contacts are left out. Bodies that are not located keep their ``speed`` [n, N + 1]. From ``onset`` (s after the
-        alert) on, the others accelerate with ``wanted`` (m/s2) up to the speed ``limit`` (m/s), [n, N + 1] each.
+        alert) on, located bodies accelerate with ``wanted`` (m/s2) up to the speed ``limit`` (m/s), [n, N + 1] each.
         """
         speed, way = np.where(self.located, self.sample[:, SAMPLE_SPEED], speed), np.zeros(speed.shape)
         move_on(speed, way, wanted, onset - self.at_s, limit, np.where(self.located, time_s - self.at_s, 0.0))
@@ -149,8 +149,8 @@ class MedianLine(NamedTuple):
     def at_alert(self, alert: State, state: State) -> State:
         """Median lines at the alert, one for each world of ``alert``.
 
-        They contain what the vehicle knows at the first decision, ``state``. Vehicles of which everything is known by
-        then start as in the true worlds ``alert``, and so does the gap between two of them.
+        They contain what the vehicle knows at the first decision, ``state``. Vehicles that are completely known by then
+        start as in the true worlds ``alert``, and so do the gaps between them.
         """
         news = self.received(state)
         known = np.asarray(news.pieces[:, :, :P_INTENT].all(axis=2))
@@ -179,7 +179,7 @@ class MedianLine(NamedTuple):
         return News(pieces, sample, located, np.where(located, sample[:, AT], 0.0))
 
     def corrected(self, state: State, median: State) -> tuple[State, Bools]:
-        """Median lines after news, and whether they had predicted all of it, [n].
+        """Median lines after news, and whether they had predicted all news, [n].
 
         ``state``: the true state. ``median``: the present median lines; those that the true state contradicts are
         corrected.
@@ -221,9 +221,9 @@ class MedianLine(NamedTuple):
         """Median lines in which received values replace assumed ones; ``state`` is the true state now.
 
         A received place and speed are extrapolated to the present by the sender's script, without contact. A sender
-        that was not accelerating is taken to react no earlier than at the time of its sample. A vehicle with an unknown
-        place keeps its distance to this vehicle, as far as the order of the line allows. This vehicle's own motion and
-        impacts are measured.
+        that was not accelerating is assumed to react no earlier than at the time of its sample. A vehicle with an
+        unknown place keeps its distance to this vehicle, as far as the order of the line allows. This vehicle's own
+        motion and impacts are measured.
         """
         body, news = self.body, self.received(state)
         line, car = median.line.copy(), median.car.copy()
@@ -275,9 +275,9 @@ class MedianLine(NamedTuple):
     def forces(self, news: News, wanted: Floats, onset: Floats, median: State, state: State) -> Floats:
         """Estimated acceleration of each body by its brakes or engine, [n, N + 1] m/s2.
 
-        It is 0 before the ``onset`` of a body (s after the alert) and its command ``wanted`` (m/s2) afterwards, unless
-        a sample of the present contains it. Bodies that are not located keep their value in ``median``. ``state``: the
-        true state.
+        Before the ``onset`` of a body (s after the alert) it is 0, afterwards the body's command ``wanted`` (m/s2). An
+        acceleration in a sample of the present replaces both. Bodies that are not located keep their acceleration in
+        ``median``. ``state``: the true state.
         """
         reacting = np.where((onset <= 0.0) | (onset < state.time_s[:, np.newaxis]), wanted, 0.0)
         force = np.where(news.located, reacting, median.line[:, FORCE])
@@ -306,8 +306,8 @@ def check_predictable(scenario: Scenario, body: int) -> None:
 def without_channel(game: Game, median: State) -> tuple[Game, State]:
     """Game and median lines in which every vehicle knows everything, for agents that drive in median lines.
 
-    A median line does not say when true values would be received, so each vehicle's own latency (without the wait for
-    the alert) ends when the vehicle reacts.
+    A median line does not say when true values would be received. Each vehicle's own latency therefore includes its
+    wait for the alert.
     """
     car = median.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]

@@ -144,8 +144,8 @@ def join_members(states: State) -> State:
 def may_be_in(state: State, members: State) -> Bools:
     """Whether all gaps and speeds of ``state`` lie within the range of the possible states ``members``, [n].
 
-    Arrays of ``members`` are [n, M, ...]. The result is true after any impact. Before it, gaps and speeds are monotone
-    in each quantity, so every world within the intervals lies in this range.
+    Arrays of ``members`` are [n, M, ...]. The result is true after any impact. Before the first impact, gaps and speeds
+    are monotone in each quantity, so every world within the intervals lies in this range.
     """
     struck = state.line[:, IMPACTS].any(axis=1) | members.line[:, :, IMPACTS].any(axis=(1, 2))
     inside = np.ones(state.n, np.bool_)

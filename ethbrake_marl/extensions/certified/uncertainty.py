@@ -59,8 +59,9 @@ class Uncertainty(NamedTuple):
     def members(self, alert: State) -> State:
         """Possible worlds, M rows for each world of ``alert``: the world itself, then the corners of its box.
 
-        Corner k takes the upper end of uncertain number i where bit i of k is 1, otherwise the lower end. Raises
-        ``InvalidInput`` if an interval does not fit the worlds, and for more than ``MOST_CORNERS`` corners.
+        The *box* contains all combinations of values in the intervals. Corner k takes the upper end of uncertain number
+        i where bit i of k is 1, otherwise the lower end. Raises ``InvalidInput`` if an interval does not fit the
+        worlds, and for more than ``MOST_CORNERS`` corners.
         """
         sides = self.sides(alert)
         if 2 ** len(sides) > MOST_CORNERS:

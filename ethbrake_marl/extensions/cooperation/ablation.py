@@ -85,20 +85,20 @@ class Ablation:
         return tuple(f"{recipe.name}-{recipe.scheme}" for recipe in self.recipes)
 
     def jobs(self) -> Iterator[tuple[Level, str, Job]]:
-        """Every training of the ablation: level, name of the algorithm (recipe and scheme), and job.
+        """Every training of the ablation: level, algorithm (recipe and scheme), and job.
 
-        A level with one learner is trained without a scheme, because schemes are for several learners.
+        A level with one learner is trained without a scheme; only the name of its folder shows this.
         """
         for seed in range(self.seeds):
             for recipe, algorithm in zip(self.recipes, self.algorithms, strict=True):
                 for level in (level for level in self.levels if level.scenario.learners):
-                    learners, name = len(level.scenario.learners), algorithm
+                    learners, folder_label = len(level.scenario.learners), algorithm
                     changes: dict[str, Any] = {"seed": seed, "total_steps": self.steps_per_learner * learners}
                     if learners == 1:  # schemes are for several learners
                         changes["scheme"] = None
-                        name = recipe.name
+                        folder_label = recipe.name
                     training = Training.of(recipe.replace(**changes), level.scenario)
-                    folder = self.folder / "trainings" / f"{level.name}-{name}-seed{seed}"
+                    folder = self.folder / "trainings" / f"{level.name}-{folder_label}-seed{seed}"
                     noted = self.noted if level.swept is None else (*self.noted, level.swept.setting)
                     yield level, algorithm, Job(training, folder, noted)
 
@@ -162,8 +162,8 @@ def measure(plan: Ablation, tell: OnProgress) -> list[LevelResult]:
 def measure_level(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None, jobs: Any) -> LevelResult:
     """Results of one level if the teams that ``jobs`` have trained drive its worlds.
 
-    Full braking of all learners is measured for comparison. Without jobs, only the scripts drive. ``algorithm``: name
-    for the results.
+    Full braking of all learners is measured for comparison. Without jobs, only the scripts drive. ``algorithm``: the
+    algorithm's name in the results.
     """
     scenario, measures = level.scenario, []
     named = {f"{algorithm} seed {seed}": f"team@{job.folder}" for seed, job in enumerate(jobs)}

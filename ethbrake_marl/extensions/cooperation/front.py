@@ -200,8 +200,8 @@ class Drivers(NamedTuple):
     def of(scenario: Scenario, weights: Floats, names: Sequence[str], count: str) -> Drivers:
         """Learners of ``scenario``, with the agents ``names`` for each row of ``weights`` [W, N].
 
-        With several learners, each of them alone is included, with the agents that can drive it. ``count``: the harm
-        that agents minimise.
+        With several learners, ``alone`` contains each of them, with the agents that can drive it. ``count``: count of
+        harm that agents minimise.
         """
         chosen = [scenario.replace(harm_weight=row.tolist(), objective="preference") for row in weights]
         teams = [make_teams(names, variant, harm_count=count) for variant in chosen]
@@ -301,7 +301,7 @@ class ProfilePool:
     def choice(self, weights: Floats) -> Ints:
         """Number of the profile with the least weighted harm in each world, [n].
 
-        Among equal profiles, the one with the least total over the vehicles. ``weights`` [N].
+        Among equal profiles, it has the least total harm of all vehicles. ``weights`` [N].
         """
         borne = np.stack(self.borne[self.count])
         amounts = weighted_harm(borne, weights)

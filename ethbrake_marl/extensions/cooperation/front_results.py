@@ -47,8 +47,8 @@ def front_results(
     """Content of ``front.json``: the front, full braking, maximin, and the agents.
 
     Means have 95 % intervals over worlds, or over recordings. For each choice of weights, ``ratio`` is an agent's mean
-    weighted harm divided by that of the front (null if the front's is 0), ``above`` the difference of both. ``beside``:
-    results to compare with the front, name -> count -> harm of each vehicle, [n, N] m2/s2; it must contain
+    weighted harm divided by the front's (null if the front's is 0), and ``above`` the agent's minus the front's.
+    ``beside``: results to compare with the front, name -> count -> harm of each vehicle, [n, N] m2/s2; it must contain
     ``full_brake``.
     """
     by = clusters_of(columns_of(drawn_worlds))
@@ -196,7 +196,7 @@ def hypervolume_sheet(results: Json) -> Sheet:
 
 @in_our_style
 def front_figure(results: Json) -> Figure:
-    """Draw one point for each choice of weights: mean harm of the line against that of the vehicle that bears most.
+    """Draw one point for each choice of weights: mean harm of the line, and of the vehicle that bears most.
 
     ``results``: the content of ``front.json``.
     """

@@ -25,9 +25,9 @@ CONFIDENCE = 0.95
 def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None) -> Estimate:
     """Mean over seeds and worlds of ``values``, or of ``values - baseline``, [seeds, worlds] each.
 
-    The estimate has no interval if there is only one world or recording, or if all values are 0 and there is no
-    baseline. A share (truth values without a baseline) always has an interval, which contains Wilson's, because
-    bootstrap intervals of nearly constant values are too narrow.
+    A share (truth values without a baseline) always has an interval. It contains Wilson's interval, because bootstrap
+    intervals of nearly constant values are too narrow. Any other estimate has none if there is only one world or
+    recording, or if all values are 0 and there is no baseline.
     """
     array = np.atleast_2d(np.asarray(values))
     sides = [array, np.zeros((1, array.shape[1])) if baseline is None else np.atleast_2d(baseline)]
@@ -36,7 +36,9 @@ def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None
     if baseline is not None or (array < 0).any():
         return Estimate(value, interval)
     if array.dtype != np.bool_:
-        return Estimate(value, interval and (max(interval[0], 0.0), interval[1]) if array.any() else None)
+        if interval is None or not array.any():
+            return Estimate(value, None)
+        return Estimate(value, (max(interval[0], 0.0), interval[1]))
     share = min(value, 1.0)  # the mean of values that are all 1 may be rounded up
     if clusters is None:
         low, high = wilson(share, array.shape[1])

@@ -12,7 +12,7 @@ WARM_UP = 3  # calls before the graph is recorded, in which torch and the driver
 
 
 class Graphed:
-    """A function of tensors that a GPU repeats as one CUDA graph. Its arguments have the same shapes in every call.
+    """A function of tensors that a GPU repeats as one CUDA graph. The arguments have the same shapes in every call.
 
     The function must not wait for the device. On a GPU the next call overwrites the result. On a processor the function
     is called as it is.

@@ -118,7 +118,7 @@ def load_world(t, stored, memory):
 
 @large
 def save_world(t, stored, memory, is_new):
-    """Copy the world from the memory of this thread to world t of ``stored``; a new world with its constant arrays."""
+    """Copy the world from the memory of this thread to world t of ``stored``; if it ``is_new``, also its constants."""
     for i in range(memory.wanted.shape[1]):
         for row in range(memory.line.shape[1]):
             stored.line[row, i, t] = memory.line[0, row, i]

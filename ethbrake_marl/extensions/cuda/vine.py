@@ -112,7 +112,7 @@ class CudaVineModel(VineModel):
     def collect(self, callback: BaseCallback) -> tuple[Tensor, StoredEpisodes]:
         """Drive all worlds for ``n_steps`` decisions.
 
-        Returns the observations [D L, F], and the states at these decisions.
+        Returns the observations of all learners, [D * L, F], and the states at these decisions.
         """
         worlds = self.worlds
         for step in range(self.recipe.n_steps):
@@ -128,7 +128,8 @@ class CudaVineModel(VineModel):
     def improve(self, observations: Any, states: Any) -> None:
         """Update the actor with gradients measured at some of the decisions that ``collect`` visited.
 
-        ``observations`` [D L, F]: observations at all visited decisions.
+        ``observations`` [D * L, F]: of L learners at all D visited decisions. ``states``: the states there; unused,
+        because ``visited`` contains them.
         """
         self.train_actor(self.measure(observations))
 
@@ -137,7 +138,7 @@ class CudaVineModel(VineModel):
         """Measured gradients at randomly drawn visited decisions.
 
         At each, two branches are simulated: one with a higher and one with a lower action than the policy's.
-        ``observations`` [D L, F]: observations at all visited decisions.
+        ``observations`` [D * L, F]: of L learners at all D visited decisions.
         """
         place = self.worlds.device
         branches = self.draw_branches(np.arange(len(observations)))
@@ -149,8 +150,8 @@ class CudaVineModel(VineModel):
     def play_here(self, world: Tensor, learner: Tensor, size: Tensor, steps: Tensor) -> Tensor:
         """Simulate branches: in each, one learner's action is moved for some steps, then the policy continues.
 
-        Returns the discounted reward, and the sum by which actions were really moved (they end at -1 and 1), [2, 2B].
-        Arguments [2B]: visited decision, learner, size of the move, and number of steps for which it lasts.
+        Returns for each branch the discounted return, and the sum of its actions' moves, [2, 2B]. Actions stay in
+        [-1, 1]. Arguments [2B]: visited decision, learner, size of the move, and number of steps for which it lasts.
         """
         worlds, result = self.branches, torch.zeros(2, len(world), dtype=size.dtype, device=size.device)
         observations, mask, discount = worlds.put(self.visited, world), learner[:, None] == self.each_learner, 1.0

@@ -19,7 +19,7 @@ from ethbrake_marl.training.training import Training
 
 
 class Vine(Algorithm):
-    """Algorithm vine: one policy controls all learners."""
+    """Algorithm vine: gradients from simulations with a higher and a lower action. One policy controls all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
         """New model. Its weights are random, or those of the policy that the recipe's key ``start`` names."""

@@ -26,7 +26,7 @@ Act = Callable[[Observations], Float32s]  # observations [rows, F] -> actions [r
 
 
 class Moment(NamedTuple):
-    """One decision in all branches that still run."""
+    """One decision in all branches (simulated copies of episodes) that still run."""
 
     state: State
     seen: Observations  # [m, L, F]
@@ -68,9 +68,9 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
 def stands_for_good(before: State, after: State, weights: Floats) -> Bools:
     """Whether all vehicles of a world stand and will never move again, if actions depend only on observations, [n].
 
-    In such a world nothing has changed in this step, no vehicle waits for its latency or for a message, and no vehicle
-    presses against another, which it could still push; ``weights`` [6] of the count of harm reveal that. Always False
-    if scripts, messages or a shield have a memory.
+    True if this step changed nothing, no vehicle waits for its latency or a message, and no vehicle presses against one
+    that it could still push (found with ``weights`` [6] of the count of harm). Always False if scripts, messages or a
+    shield have a memory.
     """
     out = np.zeros(after.n, np.bool_)
     if not after.memories:
@@ -84,7 +84,8 @@ def find_standing(
 ) -> None:
     """Write to ``out`` [n] whether nothing changed in this step, and no vehicle waits for its latency or for a message.
 
-    ``before``, ``line``: the rows of ``State.line`` before and after the step (see ``stands_for_good``).
+    ``before``, ``line``: ``State.line`` before and after the step. ``car``, ``know``: as in ``State`` after the step,
+    ``clock``: before. ``weights``: as for ``stands_for_good``.
     """
     bodies = line.shape[2]
     for k in range(len(out)):

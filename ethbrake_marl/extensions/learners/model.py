@@ -1,4 +1,4 @@
-"""The training loop of both algorithms: drive without exploration, try other actions at visited decisions, learn."""
+"""Training loop of vine and rollout classification: drive without exploration, try other actions, learn."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class BranchingModel(BaseAlgorithm):
     def collect(self, callback: BaseCallback) -> tuple[Any, Any]:
         """Drive all n worlds for ``n_steps`` decisions.
 
-        Returns the observations, [n_steps n L, F], and the states, [n_steps n].
+        Returns the observations, [n_steps * n * L, F], and the states, [n_steps * n].
         """
         all_observations, states, all_rows = [], [], np.arange(self.rows.n)
         for _ in range(self.recipe.n_steps):

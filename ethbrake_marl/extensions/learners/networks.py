@@ -78,7 +78,7 @@ class AveragedNetwork(nn.Module):
         return chosen
 
     def weights(self, name: str) -> dict[str, Tensor]:
-        """Weights of ``average``, under names for a policy file that begin with ``name``."""
+        """Weights of ``average`` for a policy file, name of a tensor -> tensor; all names begin with ``name``."""
         linear = linear_layers(self.average)
         places = [f"{name}.{k}" for k in range(len(linear) - 1)] + [f"{name}.output"]
         layers = zip(places, linear, strict=True)

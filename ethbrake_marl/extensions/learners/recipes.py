@@ -36,7 +36,7 @@ class Range(FileModel):
 
 
 class BranchingRecipe(TrainingRecipe):
-    """Keys of both algorithms, which try actions at visited decisions and simulate each branch to its end."""
+    """Keys of vine and rollout classification, which try actions at visited decisions and simulate to the end."""
 
     n_steps: int = Field(ge=1, description="number of decisions in each world between two updates")
     tried: int = Field(ge=1, description="number of decisions per update at which other actions are tried")
@@ -98,8 +98,8 @@ class ChoosingShape(FileModel):
 class RolloutClassificationRecipe(BranchingRecipe):
     """Recipe of rollout classification: several choices are tried at a decision, and the network learns the cheapest.
 
-    A choice is one of ``network.choices`` actions. Tried are the policy's own choice, an action below and one above it
-    for each range of ``near``, the ``fixed`` actions, and ``drawn`` others.
+    A choice is one of ``network.choices`` actions. The tried choices are the policy's choice, one below and one above
+    it for each range of ``near``, the ``fixed`` actions, and ``drawn`` others.
     The *cost* of a choice is minus the return from the decision to the end of the episode.
     """
 

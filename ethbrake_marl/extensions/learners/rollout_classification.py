@@ -31,7 +31,7 @@ FOR_GOOD = 2**31  # steps, more than an episode has
 
 
 class ChoiceBranches(NamedTuple):
-    """M simulations to the end. A branch begins at a decision with a choice; afterwards the network decides."""
+    """M simulations from B decisions to the end. A choice is held first; afterwards the network decides."""
 
     decision: Ints  # [M] 0 to B - 1
     choice: Ints  # [M] number of an action of the network

@@ -29,8 +29,8 @@ def starting_policy(name: str, recipe: str) -> Policy:
 def start_weights(policy: Policy, network: NetworkSpec, features: Sequence[str], recipe: str) -> dict[str, Float32s]:
     """Weights of ``policy`` for the network ``network``, which observes ``features``.
 
-    Raises ``InvalidInput`` if the network has other layers than the policy, or if ``features`` lack a feature that the
-    policy observes.
+    ``recipe``: name of the recipe, for error messages. Raises ``InvalidInput`` if the network has other layers than the
+    policy, or if ``features`` lack a feature that the policy observes.
     """
     for name in ("policy_hidden", "activation", "output"):
         if getattr(policy.manifest.network, name) != getattr(network, name):

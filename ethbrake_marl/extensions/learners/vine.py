@@ -47,7 +47,7 @@ class ClippedActor(AveragedNetwork):
 
 
 class Branches(NamedTuple):
-    """Two branches of each of B visited decisions: first B with a higher action, then B with a lower one."""
+    """Two simulated branches of each of B visited decisions: first B with a higher action, then B with a lower one."""
 
     world: Ints  # [2B] number of the visited state
     learner: Ints  # [2B] learner whose action is moved, from 0
@@ -80,9 +80,7 @@ class VineModel(BranchingModel):
         self.train_actor(self.try_out(observations, states))
 
     def try_out(self, observations: Float32s, states: State) -> TrialResults:
-        """Draw visited decisions; simulate one branch of each with a higher action than the policy's, and one with a
-        lower.
-        """
+        """Results at random visited decisions, simulated with a higher and with a lower action than the policy's."""
         branches = self.draw_branches(np.flatnonzero(moving(states).repeat(self.learners)))
         gained, moved = self.play(states, branches)
         sample = observations[branches.decisions(self.learners)]
@@ -97,8 +95,7 @@ class VineModel(BranchingModel):
         return Branches(world, learner, np.concatenate([sizes, -sizes]), np.tile(self.drawn_steps(len(rows)), 2))
 
     def play(self, states: State, branches: Branches) -> tuple[Floats, Floats]:
-        """Simulate branches to the end; return each branch's return of its learner, and how far actions were moved,
-        [2B] each.
+        """Discounted return of each branch's learner, and how far its actions were moved, [2B] each.
 
         An action stays in [-1, 1], so it may move by less than ``size``. Moves are summed over the steps.
         """

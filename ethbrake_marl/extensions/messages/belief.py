@@ -75,9 +75,9 @@ def known_pieces(state: State, observer: int) -> Bools:
 def belief_of(state: State, observer: int) -> State:
     """State as the body ``observer`` estimates it. Unknown quantities are NaN, except gaps.
 
-    Old samples are extrapolated to the present (``links.estimate_worlds``). ``know`` is infinite for a body of which
-    the observer knows nothing. ``wanted`` contains the newest intents (commands) that it has received. Gaps add up to
-    the distances between bodies with a known place.
+    Gaps add up to the distances between bodies with a known place. Old samples are extrapolated to the present
+    (``links.estimate_worlds``). ``know`` is infinite for a body of which the observer knows nothing. ``wanted``
+    contains the newest intents (commands) received.
     """
     known = known_pieces(state, observer)
     news = newest_samples(state, observer)
@@ -86,7 +86,7 @@ def belief_of(state: State, observer: int) -> State:
         for row, piece in rows.items():
             array[:, row][~known[:, :, piece]] = np.nan
     wanted = np.where(known[:, :, P_INTENT], news[:, INTENT], np.nan)
-    wanted[:, [0, observer]] = state.wanted[:, [0, observer]]
+    wanted[:, [0, observer]] = state.wanted[:, [0, observer]]  # the obstacle, and the observer itself
     return state._replace(
         line=line, car=car, know=_known_if(state, observer, np.asarray(known.any(axis=2))), wanted=wanted
     )
@@ -95,8 +95,8 @@ def belief_of(state: State, observer: int) -> State:
 def predictable_belief_of(state: State, observer: int) -> State:
     """State as the body ``observer`` estimates it, without the vehicles that it cannot predict.
 
-    It can predict a vehicle of which it knows all quantities, except perhaps the intent. For the others ``know`` is
-    infinite.
+    The observer can predict a vehicle of which it knows all quantities, except perhaps the intent. ``know`` is infinite
+    for all other bodies.
     """
     known = known_pieces(state, observer)
     line, predictable = (
@@ -115,8 +115,8 @@ def _known_if(state: State, observer: int, holds: Bools) -> Floats:
 def ages_s(state: State) -> Floats:
     """Age of the newest sample that body i has of body j, [n, N + 1, N + 1] s; infinite if i has none.
 
-    Body 0 is the obstacle. Without periodic messages all ages are 0, because body i then knows the present state, from
-    the time ``state.know`` on.
+    Body 0 is the obstacle. Without periodic messages all ages are 0, because from the time ``state.know`` on body i
+    knows the present state of body j.
     """
     memory: MessageMemory = state.memories[MESSAGES_KEY]
     if not memory.is_periodic:

@@ -71,7 +71,10 @@ class Messages(Extension):
     name, keys = "messages", MessageKeys
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Keys of ``v2x`` that have an effect on messages after the first. Raises an error for keys without effect."""
+        """Keys of ``v2x`` that affect messages after the first.
+
+        Raises an error if a key of this extension is set but has no effect.
+        """
         tells = _value(v2x, "tells")
         right = "needs a channel with separate messages; use a preset that generates messages, such as nominal"
         sent = v2x.hears != "none" and v2x.timing != "latency"

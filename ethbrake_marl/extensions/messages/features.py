@@ -15,7 +15,7 @@ from ethbrake_marl.registry import Part
 
 
 def age(state: State, body: int, neighbour: int) -> Floats:
-    """Age of the newest sample received from the neighbour; 0 if its present state is known, or nothing of it."""
+    """Age of the newest sample from the neighbour, [n] s; 0 if there is none, and without periodic messages."""
     if MESSAGES_KEY not in state.memories:
         return np.zeros(state.n)
     ages = ages_s(state)[:, body, neighbour]

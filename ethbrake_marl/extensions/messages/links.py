@@ -134,8 +134,8 @@ def present(state: State) -> Floats:
 def begin_messages(alert: State, start_s: Floats, time_step_s: float, sent: Callable[[State], State]) -> MessageMemory:
     """Memory at the first decision, ``start_s`` [n] (s), with what has been received since the alert.
 
-    Until then vehicles execute ``alert.wanted``. ``sent``: function from the true state to the state that vehicles send
-    and measure.
+    Before the first decision, vehicles execute ``alert.wanted``. ``sent``: function from the true state to the state
+    that vehicles send and measure.
     """
     memory, line = _writable_copy(alert.memories[MESSAGES_KEY]), alert.line.copy()
     force = np.where(alert.car[:, LATENCY] <= 0.0, alert.wanted, 0.0)
@@ -189,7 +189,7 @@ def _sample(memory: MessageMemory, state: State, way_m: Floats, rows: Bools) -> 
 
 
 def newest_samples(state: State, observer: int) -> Floats:
-    """Newest sample that the body ``observer`` has of each body, [n, SAMPLE_ROWS, N + 1]."""
+    """Newest sample (recorded motion) that the body ``observer`` has of each body, [n, SAMPLE_ROWS, N + 1]."""
     memory: MessageMemory = state.memories[MESSAGES_KEY]
     if not memory.is_periodic:
         return present(state)
@@ -277,13 +277,13 @@ def moved_on(speed, force, limit, duration):
 
 @large
 def estimate_worlds(observer, time, limit, known, news, aged, line, place, fresh):
-    """Overwrite the true ``line`` (``State.line``) by the line as the body ``observer`` estimates it.
+    """Overwrite the true ``line`` (``State.line``) with the line as the body ``observer`` estimates it.
 
     The newest sample of each body, ``news`` [n, SAMPLE_ROWS, N + 1], is extrapolated to ``time`` [n] (s) with a
-    constant force, up to the speed ``limit`` [n, N + 1] (m/s), and without contact. Between two samples of the present
-    the gap is the true one. If the place of a body is not ``known`` [n, N + 1, PIECES], the place of the next body
-    towards the observer is used; an unknown speed or force is 0. If samples may be old (``aged``), the observer knows
-    of no impact between other vehicles. ``place`` and ``fresh`` [N + 1]: memory, overwritten.
+    constant force, up to the speed ``limit`` [n, N + 1] (m/s), and without contact. The gap between two bodies with
+    samples of the present is the true one. If the place of a body is not ``known`` [n, N + 1, PIECES], the place of the
+    next body towards the observer is used; an unknown speed or force is 0. If samples may be old (``aged``), the
+    observer knows of no impact between other vehicles. ``place`` and ``fresh`` [N + 1]: memory, overwritten.
     """
     bodies = line.shape[2]
     for k in range(len(time)):

@@ -37,9 +37,9 @@ class SearchMemory(NamedTuple):
 
 
 class Planner:
-    """Agent that chooses all its commands at the alert and then gives them, assuming that other learners brake fully.
+    """Agent that chooses all its commands at the alert. It assumes that other learners brake fully.
 
-    If they do brake fully, the harm that happens is the memory's ``predicted_harm``, to the last bit.
+    If the other learners do so, the harm that happens is the memory's ``predicted_harm``, to the last bit.
     """
 
     knows = MODEL
@@ -48,14 +48,14 @@ class Planner:
         self.name, self.scenario, self.count = name, scenario, count
 
     def begin(self, alert: State, body: int) -> SearchMemory:
-        """Choose the commands. Raises ``InvalidInput`` if another vehicle's commands are not known at the alert."""
+        """Choose all commands. Raises ``InvalidInput`` if another vehicle's commands are not known at the alert."""
         game, alert = single_learner_game(self.scenario, alert, body)
         problem = problem_of(game, alert, count=self.count, objective=self.scenario.objective)
         commands, harm = self.choose(game, alert, problem, body)
         return SearchMemory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        """Commands of vehicle ``body`` at every decision, [n, T] m/s2, and what they cost, [n] m2/s2."""
+        """Commands of vehicle ``body`` at all T decisions, [n, T] m/s2, and what they cost, [n] m2/s2."""
         raise NotImplementedError
 
     def act(self, state: State, memory: SearchMemory, body: int) -> tuple[Floats, SearchMemory]:
@@ -69,8 +69,9 @@ class Planner:
 class BestHarm(Planner):
     """Agent that drives the best known commands: from a shipped table, or from a search.
 
-    A search begins with the choice of E-V2X-BM. If the agent is the only learner, the better of the search's result and
-    a shipped policy's commands is improved once more, so the agent never does more harm than either.
+    A search begins with the choice of E-V2X-BM. If the agent is the only learner, the search's result is
+    compared with the commands of a shipped policy. The better one is improved once more, so the agent never does more
+    harm than that policy.
     """
 
     def __init__(

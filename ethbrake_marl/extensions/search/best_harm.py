@@ -178,7 +178,7 @@ def search_list(
 
 
 def agent_commands(problem: Problem, game: Game, alert: State, team: Team) -> Floats:
-    """Commands of a team that drives the worlds, at every decision of ``problem``, [n, T, B] m/s2.
+    """Commands of a team that drives the worlds, at all T decisions of ``problem``, [n, T, B] m/s2.
 
     After the end of the episodes, the last commands are repeated.
     """

@@ -28,8 +28,8 @@ WAYS = ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5))  # (`early`, `share`) in `write_
 def extreme_profiles(problem: Problem) -> Profiles:
     """Best profiles of full driving and full braking for one controlled vehicle, [n * KEPT_PROFILES], world by world.
 
-    The contacts with its neighbours are predicted as if these braked fully. In worlds without neighbours, or with a
-    vehicle that moves backward, the profiles coast.
+    The contacts with its neighbours are predicted as if the neighbours braked fully. In worlds without neighbours, or
+    with a vehicle that moves backward, the profiles coast.
     """
     (body,), n, last = problem.bodies.tolist(), problem.n, problem.last_step
     at, random = rows_of(problem.state, body), random_states(problem.identity, 0)
@@ -59,14 +59,13 @@ def extreme_profiles(problem: Problem) -> Profiles:
 
 @large
 def write_extreme(kind, change, meeting, early, share, step, last, low, high, ends, commands):
-    """Write the profile that changes from one extreme command to the other at ``change`` (s), and back at ``meeting``
-    (s).
+    """Write a profile of full driving and full braking to ``ends`` [5] and ``commands`` [5, 1].
 
-    The profile is written to ``ends`` [5] and ``commands`` [5, 1]. ``kind`` 0 drives, brakes and drives; 1 brakes,
-    drives and brakes. Commands can change only between steps of ``step`` s: in the step of the first change the command
-    is the mean of both, so that the speed after the step is exact. The second change is ``early`` steps earlier, with
-    the ``share`` of the last command in its step. ``last``: last step. ``low``, ``high``: full braking and full driving
-    (m/s2).
+    ``kind`` 0: drive, brake, drive; 1: brake, drive, brake. The first change is at ``change`` (s after the first
+    decision). In its step, of ``step`` s, the command is the mean over the step, so the speed after the step is exact.
+    The second change is ``early`` steps before the step of ``meeting`` (s; infinite: never). In its step the command is
+    ``share`` times the last command plus 1 - ``share`` times the second. ``last``: last step. ``low``, ``high``: full
+    braking and full driving (m/s2).
     """
     first, second = (high, low) if kind == 0 else (low, high)
     turn = int(min(change / step, float(last)))

@@ -65,7 +65,7 @@ class Room(NamedTuple):
 
 
 class Field(NamedTuple):
-    """The best M profiles of one world so far."""
+    """The best M profiles (commands over time) of one world so far."""
 
     ends: Ints  # [M, K]
     commands: Floats  # [M, K, B]
@@ -202,7 +202,7 @@ def draw_profile(world, drawing, ends, commands):
 def draw_change(world, active, drawing, change):
     """Write a random change of one of the first ``active`` phases of a profile to ``change`` [CHANGE].
 
-    ``world`` is a ``World``, ``drawing`` [DRAWING] says how to draw. The logarithm of an amount is uniform.
+    ``world`` is a ``World``, ``drawing`` [DRAWING] says how to draw. The logarithm of an added amount is uniform.
     """
     random, bounds = world.random, world.bounds
     if drawing[KIND] == PLAN:
@@ -277,11 +277,11 @@ def largest_place(values):
 
 @large
 def gather(world, room, ends, commands, phases, random_count, drawing, tolerance, field):
-    """Fill ``field`` with the best of Q profiles and of ``random_count`` random ones, in any order.
+    """Fill ``field`` with the best of Q profiles and ``random_count`` random profiles; its places are not sorted.
 
-    ``ends`` [Q, K], ``commands`` [Q, K, B], ``phases`` [Q] (number of phases; 0: empty place): the Q profiles. Of
-    profiles whose values differ by less than ``tolerance`` (m2/s2), only the first is kept. ``world``, ``room``,
-    ``field``: a ``World``, ``Room``, ``Field``. ``drawing``: as for ``draw_profile``.
+    ``ends`` [Q, K], ``commands`` [Q, K, B]: the Q profiles. ``phases`` [Q]: their numbers of phases, at most K (0:
+    empty place). Of profiles whose values differ by less than ``tolerance`` (m2/s2), only the first is kept. ``world``,
+    ``room``, ``field``: a ``World``, ``Room``, ``Field``. ``drawing``: as for ``draw_profile``.
     """
     worst, number = 0, ends.shape[0]
     begin = min(worst, number)  # 0, but no literal: numba would compile the physics again for it
@@ -349,7 +349,10 @@ def improve(world, room, ends, commands, budget, drawing, least):
 
 @large
 def try_all(world, room, ends, commands, values):
-    """Write the value of every profile [Q, K] in a ``World`` to ``values`` [Q]; infinite if it cannot be simulated."""
+    """Write the value (m2/s2) of each of Q profiles to ``values`` [Q]; infinite if a profile cannot be simulated.
+
+    ``world``, ``room``: a ``World``, ``Room``. ``ends`` [Q, K], ``commands`` [Q, K, B]: the profiles.
+    """
     begin = min(0, ends.shape[0])  # no literal, as in `gather`
     for q in range(ends.shape[0]):
         value, reached = follow(world, room.lines, ends[q], commands[q], begin, math.inf)

@@ -45,7 +45,7 @@ def _why_unknown(scenario: str) -> str:
 
 
 def best_known(game: Game, alert: State, last: State) -> MeasureValue:
-    """Least harm (honest: least honest cost) of the world in a shipped table, found by a search or an agent.
+    """Least known harm or honest cost of each world, from the shipped tables, count -> [n] m2/s2.
 
     The result is the same for every agent.
     """
@@ -53,7 +53,7 @@ def best_known(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 def regret(game: Game, alert: State, last: State) -> MeasureValue:
-    """Harm (or honest cost) minus the least known in the same world. Below 0: the agent did even less."""
+    """Harm (or honest cost) minus the least known in the same world. Below 0: the agent did less than was known."""
     return {count: last.harm(count) - harm for count, harm in least_known_values(game, alert).items()}
 
 

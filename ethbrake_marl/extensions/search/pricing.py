@@ -66,9 +66,10 @@ LARGEST = 2.0  # largest weighted harm of a vehicle
 
 
 class Profiles(NamedTuple):
-    """One profile in each of n worlds: ``commands_mps2[k, j]`` holds in world k until decision ``ends[k, j]``.
+    """A profile (commands over time) for each of n worlds.
 
-    Phases that a profile does not need are empty: they begin and end at the last step.
+    In world k, ``commands_mps2[k, j]`` holds until decision ``ends[k, j]``. Phases that a profile does not need are
+    empty: they begin and end at the last step.
     """
 
     ends: Ints  # [n, K] number of the decision at which each phase ends
@@ -86,7 +87,7 @@ class Profiles(NamedTuple):
     def shorten(self) -> Profiles:
         """Profiles with ``MOST_PHASES`` phases.
 
-        Of a longer profile only some decisions are kept; their commands hold until the next of them.
+        Of a longer profile only the commands at some decisions are kept. Each holds until the next of these decisions.
         """
         ends, commands = Profiles.pad([self], MOST_PHASES)[0]
         fits = ends[:, MOST_PHASES - 1] == ends[:, -1]
@@ -97,7 +98,7 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def of_steps(commands_mps2: Floats, last_step: Ints) -> Profiles:
-        """Profiles with one phase for each decision, from commands [n, T, B].
+        """Profiles with one phase for each of T decisions, from the commands [n, T, B] (m/s2) at these decisions.
 
         ``last_step`` [n]: number of decisions before the horizon.
         """
@@ -179,10 +180,10 @@ class Problem(NamedTuple):
         return np.minimum(low + share * (high - low), high)
 
     def constant(self, commands_mps2: Floats) -> Profiles:
-        """Profiles that hold the commands ``commands_mps2`` [n, Q, B], as [n * Q]: first the Q profiles of world 0, and
-        so on.
+        """Profiles that hold one of Q commands to the end, [n * Q]: first the Q profiles of world 0, and so on.
 
-        A profile has several phases with the same command, which a search can change one by one.
+        ``commands_mps2`` [n, Q, B]: the commands. A profile has several phases with the same command, which a search
+        can change one by one.
         """
         n, Q, B = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
@@ -274,7 +275,7 @@ def problem_of(
     Learners that are not among ``bodies`` brake fully; all other vehicles hold the commands of their roles.
 
     ``bodies``: controlled vehicles (1: Vehicle 1); None: the learners. ``count``: what is minimised
-    (``episode.counts``). ``objective``: whose harm counts, as under a scenario's key ``objective``. ``deciders``:
+    (``episode.counts``). ``objective``: whose harm counts, as in a scenario's key ``objective``. ``deciders``:
     vehicles whose shortest latency is the time of the first decision; None: ``bodies``.
 
     Raises ``InvalidInput`` for vehicles that do not exist, an unknown count, an objective that is not a weighted sum of
@@ -312,9 +313,9 @@ def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
 def beside_braking(problem: Problem, single_problem: Problem, profiles: Profiles) -> Profiles:
     """Profiles for ``problem`` in which one vehicle follows ``profiles`` and the other controlled vehicles brake fully.
 
-    ``single_problem``: the problem of this vehicle alone, in the same worlds, with the solutions ``profiles``. Its
-    first decision may be later, because the vehicle's latency is longer; decisions that are not decisions of
-    ``problem`` are rounded to the nearest of these.
+    ``single_problem``: the problem of this vehicle alone in the same worlds; ``profiles`` are its solutions. Its first
+    decision may be later than the first one of ``problem``, because the vehicle's latency is longer. Times between two
+    decisions of ``problem`` are rounded to the nearest decision.
     """
     later = single_problem.state.clock[:, FIRST_DECISION] - problem.state.clock[:, FIRST_DECISION]
     last = problem.last_step[:, np.newaxis]
@@ -328,25 +329,26 @@ def beside_braking(problem: Problem, single_problem: Problem, profiles: Profiles
 def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
     """Hash of everything that decides the harm of a profile, [n]: 8 bytes of BLAKE2b of each world.
 
-    Hashed are the world, the commands of all other vehicles, which vehicles are controlled (``bodies``), and ``times``
+    The hash covers the world, the controlled vehicles (``bodies``), the commands of all other vehicles, and ``times``
     [n, 4]: first decision, time step, number of steps, end.
     """
     line, car, digests = alert.line, alert.car, np.empty(alert.n, np.uint64)
     controlled = np.zeros(alert.wanted.shape)
     controlled[:, bodies] = 1.0
-    for ahead in (0, 1):  # an obstacle counts as a vehicle; a world's hash does not depend on the other worlds
-        rows = np.flatnonzero((line[:, GAP, 0] >= FAR_M) == bool(ahead))
-        of_line, of_car = line[rows][:, :, ahead:], car[rows][:, :, ahead:]
+    for first_body in (0, 1):  # an obstacle counts as a vehicle; a world's hash does not depend on the other worlds
+        rows = np.flatnonzero((line[:, GAP, 0] >= FAR_M) == bool(first_body))
+        of_line, of_car = line[rows][:, :, first_body:], car[rows][:, :, first_body:]
         parts = [alert.time_s[rows, np.newaxis], of_line[:, SPEED], of_line[:, GAP, :-1], of_line[:, HIT, :-1]]
         parts += [of_car[:, RESTITUTION, :1], *(of_car[:, row] for row in (BRAKING, DRIVING, LATENCY, MASS, LIMIT))]
-        parts += [alert.wanted[rows, ahead:], times[rows], controlled[rows, ahead:]]
+        parts += [alert.wanted[rows, first_body:], times[rows], controlled[rows, first_body:]]
+        # forces matter only if brakes build up
         forces = [of_line[:, FORCE], of_car[:, BRAKE_RATE], of_car[:, RELEASE_RATE]]
-        builds = np.isfinite(of_car[:, [BRAKE_RATE, RELEASE_RATE]]).sum(axis=(1, 2))
+        brakes_build_up = np.isfinite(of_car[:, [BRAKE_RATE, RELEASE_RATE]]).sum(axis=(1, 2))
         motion_rows, force_rows = (
             np.ascontiguousarray(np.hstack(arrays) + 0.0, "<f8") for arrays in (parts, forces)
         )  # -0.0 is 0.0
         for k, row in enumerate(rows):
-            content = motion_rows[k].tobytes() + (force_rows[k].tobytes() if builds[k] else b"")
+            content = motion_rows[k].tobytes() + (force_rows[k].tobytes() if brakes_build_up[k] else b"")
             digests[row] = int.from_bytes(hashlib.blake2b(content, digest_size=8).digest(), "little")
     return digests
 
@@ -404,8 +406,8 @@ def worths(line, shares, weights, aim, out):
 def follow_worlds(line, car, clock, wanted, ends, commands, bodies, time_step_s, scratch, failed):
     """Simulate every world's profile to the end, decision by decision; change ``line``, ``clock``, ``wanted`` in place.
 
-    These and ``car`` are as in ``State``; ``ends``, ``commands`` as in ``Profiles``. ``failed`` [n] becomes True where
-    a check of the physics failed.
+    ``line``, ``car``, ``clock``, ``wanted``: as in ``State``. ``ends``, ``commands``: as in ``Profiles``. ``failed``
+    [n] becomes True where a check of the physics failed.
     """
     for k in range(len(failed)):
         phase = 0

@@ -40,12 +40,13 @@ def search_profiles(
 ) -> tuple[Profiles, dict[str, Floats]]:
     """Search each world for the best profile; return the profiles, and what they cost, count -> [n] m2/s2.
 
-    They are at least as good as the profiles ``starts``, [n * Q] each: first the Q profiles of world 0, and so on.
-    ``budget`` is about the number of profiles that are simulated in each world. The result does not depend on the
-    number of threads. Finally the best profile is polished: its commands are changed at single decisions and, if one
-    vehicle is controlled, also at several decisions at once.
+    The result is at least as good as all profiles of ``starts``. Each part of ``starts`` has Q profiles for each world,
+    [n * Q]: first the Q profiles of world 0, and so on. ``budget`` is about the number of profiles that are simulated
+    in each world. The result does not depend on the number of threads. Finally the best profile is polished: its
+    commands are changed at single decisions and, if one vehicle is controlled, also at several decisions at once.
 
-    Raises ``InvalidInput`` for a bad number, and ``PhysicsError`` for worlds in which no profile can be simulated.
+    Raises ``InvalidInput`` for an invalid budget, seed or number of threads, and ``PhysicsError`` for worlds in which
+    no profile can be simulated.
     """
     for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)
@@ -91,9 +92,9 @@ def search_profiles(
 
 
 def join_profiles(parts: Sequence[Profiles], n: int) -> Profiles:
-    """Profiles of all ``parts``, which have [n * q] each, arranged by world, [n, Q].
+    """Profiles of all ``parts``, arranged by world, [n, Q].
 
-    q may differ between parts, but not the number of phases.
+    A part has q profiles for each of n worlds, [n * q]. q may differ between parts, but not the number of phases.
     """
     K, B = parts[0].commands_mps2.shape[1:]
     ends = np.concatenate([part.ends.reshape(n, -1, K) for part in parts], axis=1)
@@ -106,9 +107,9 @@ def search_world(world: World, room: Room, starts: Profiles, last: int, budget: 
     ``starts``: profiles that are tried first. ``last``: number of decisions. ``budget``: number of profiles to
     simulate.
 
-    First many profiles are improved in rounds, each of which keeps the better half. Then the phases of the best are
-    divided, and it is improved again; finally with a step-by-step simulation, because where harm jumps, rounding
-    decides how large it is.
+    First many profiles are improved in rounds. Each round keeps the better half. Then the phases of the best profile
+    are divided, and it is improved again. Finally it is improved with a step-by-step simulation, because rounding
+    decides how large harm is where harm jumps.
     """
     K, B = room.commands.shape
     M, rounds = SMALLEST_FIELD, 3
@@ -146,9 +147,9 @@ def sort(field: Field, survivors: int) -> None:
 
 
 def compact(ends: Ints, commands: Floats) -> Profiles:
-    """Profile [1] without empty phases, with neighbouring phases of equal commands joined.
+    """One profile without empty phases, [1]. Neighbouring phases with equal commands are joined.
 
-    ``ends`` [K], ``commands`` [K, B] m/s2.
+    ``ends`` [K], ``commands`` [K, B] (m/s2): the profile.
     """
     there = np.diff(ends, prepend=0) > 0
     ends, commands = ends[there], commands[there]
@@ -157,7 +158,7 @@ def compact(ends: Ints, commands: Floats) -> Profiles:
 
 
 def halve_phases(field: Field, attention: int) -> None:
-    """Halve phases of the best profile in ``field`` until it has K phases.
+    """Halve phases of the best profile in ``field`` until it has K phases, the most that ``field`` can hold.
 
     The next phase to halve is the longest within the first ``attention`` steps.
     """
@@ -173,7 +174,7 @@ def halve_phases(field: Field, attention: int) -> None:
 
 
 def select(world: World, room: Room, starts: Profiles, field: Field) -> None:
-    """Put the best profile of ``field`` and ``starts`` at index 0 of ``field``; let ``world`` simulate step by step."""
+    """Put the best of ``field`` and ``starts`` at index 0 of ``field``. Then ``world`` is simulated step by step."""
     world.numbers[STEPWISE] = 1.0
     best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
     gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
@@ -183,10 +184,10 @@ def select(world: World, room: Room, starts: Profiles, field: Field) -> None:
 
 
 def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
-    """Improve one vehicle's commands at every decision; return the best, [n, T] m/s2, and their values, [n] m2/s2.
+    """Improve one vehicle's commands at T decisions; return the best, [n, T] m/s2, and their values, [n] m2/s2.
 
-    They are at least as good as ``commands_mps2`` [n, T]. Because small changes may miss the best commands, the best of
-    some random *templates* is improved as well: one command, another for a while, then full braking.
+    The result is at least as good as ``commands_mps2`` [n, T]. Small changes may miss the best commands, so the best of
+    some random *templates* is improved as well. A template has one command, another for a while, then full braking.
 
     Raises ``InvalidInput`` for several controlled vehicles, commands that do not fit, or a budget below 1, and
     ``PhysicsError`` for worlds in which ``commands_mps2`` cannot be simulated.
@@ -236,7 +237,7 @@ def field_for(profiles: int, phases: int, controlled: int) -> Field:
 
 
 def prepare_world(problem: Problem, k: int, random: UInt64s, phases: int, stepwise: bool) -> tuple[World, Room]:
-    """World ``k`` of a problem for the compiled search, and the working memory for profiles of ``phases`` phases.
+    """The compiled search's form of world ``k``, and working memory for profiles of up to ``phases`` phases.
 
     ``random`` [n]: states of the random number generators. ``stepwise``: simulate decision by decision.
     """

@@ -33,7 +33,7 @@ OF_COUNT = {"harm": ("<f8", 1), "ends": ("<u2", 2), "commands": ("<f8", 3)}  # a
 
 @dataclass(frozen=True, slots=True)
 class BestHarmTable:
-    """Least known harm of n worlds in some counts of harm, with the profiles that reach it."""
+    """Least known harm of n worlds in some counts of harm, with the profiles (commands over time) that reach it."""
 
     identity: UInt64s  # [n] hash of each world (``pricing.identities``)
     harm: Mapping[str, Floats]  # count -> [n] m2/s2, or what else the search has minimised
