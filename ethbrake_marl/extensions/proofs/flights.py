@@ -40,9 +40,10 @@ def flight_lead(pair, opening, flight):
 
 @kernel
 def best_flight(pair, opening):
-    """Duration (s) of the flight with the largest lead, for one speed of separation ``opening`` (m/s).
+    """Duration (s) of the flight with the largest lead (``flight_lead``).
 
-    The duration is infinite if a longer flight always has a larger lead. ``pair``: top of this file.
+    It is infinite if a longer flight always has a larger lead. ``opening``: speed at which the two separate (m/s).
+    ``pair``: top of this file.
     """
     share, press, reach, _ = pair
     if press <= 0.0:
@@ -61,9 +62,9 @@ def best_flight(pair, opening):
 
 @large
 def lead(pair, opening, shortest, longest, lost):
-    """Largest lead (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
+    """Largest lead (m/s) of all flights that last from ``shortest`` to ``longest`` seconds (``flight_lead``).
 
-    The maximum is over all speeds of separation up to ``opening`` (m/s), because in a limited time a smaller one may
+    The maximum is over all speeds of separation up to ``opening`` (m/s), because in a limited time a smaller speed may
     give a larger lead. ``pair``, ``lost``: top of this file.
     """
     share, press, reach, _ = pair
