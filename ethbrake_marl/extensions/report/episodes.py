@@ -33,9 +33,9 @@ def player(
 ) -> Markup:
     """Player of the episodes of all agents in some worlds, as HTML.
 
-    At first it shows at most three agents: ``focus`` (the agent that the page is about), the first and the last.
-    ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, sampled
-    every ``MOTION_SAMPLE_S`` seconds.
+    At first the player shows at most three agents: ``focus`` (the agent that the page is about), the first and the
+    last. ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds,
+    sampled every ``MOTION_SAMPLE_S`` seconds.
     """
     result, agents, worlds = compared.result, list(records), list[dict[str, Any]]()
     for (row, kind), *episodes in zip(kinds.items(), *records.values(), strict=True):

@@ -19,7 +19,7 @@ where f(n) is its speed after the impacts of sample n. Where the gap of a pair i
 * ``0 <= v <= v_max`` is a constraint on u in the paper: commands are limited so that the next sample satisfies it. An
   impact can leave a negative speed: brakes bring it back to 0 with the commanded deceleration. It can leave a speed
   above v_max: the engine then has no effect. A coasting vehicle keeps its speed in both cases.
-* Times are rounded, so a latency has elapsed at a sample that is at most 1e-6 of a step before its end.
+* Times are rounded, so a latency has elapsed at a sample that is at most 1e-6 of a step before the latency's end.
 
 With this map, the reward term ``collision`` is the paper's r_collision at the sample at which a step begins; an overlap
 at an episode's last sample does not count. The term ``risk`` is computed at the sample at which the step ends. As in

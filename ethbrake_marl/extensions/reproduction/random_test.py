@@ -1,8 +1,9 @@
 """The paper's random test (``Table:Random``): collision rate and mean harm of its four strategies.
 
 A *reading* is one interpretation of the paper's text: a value for each quantity that the text leaves open
-(``readings``). Readings that share the values on which a simulation depends are simulated once. The paper's *hybrid*
-follows a policy where its harm is at most that of E-V2X-BM, called H*, and E-V2X-BM elsewhere.
+(``readings``). Readings that share the values on which a simulation depends are simulated once. H* is the harm
+of E-V2X-BM. The paper's *hybrid* follows a policy in the worlds in which the policy's harm is at most H*, and E-V2X-BM
+in all others.
 """
 
 from __future__ import annotations

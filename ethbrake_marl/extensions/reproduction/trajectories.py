@@ -215,7 +215,8 @@ def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[
 def profile_of(record: EpisodeRecord) -> tuple[float, float, float]:
     """First command of Vehicle 2 (m/s2), sum of the absolute changes of its command (m/s2), and share of braking.
 
-    Only the time after its latency counts. The share is the fraction of the time in motion in which it brakes.
+    Only the time after the vehicle's latency counts. The share is the fraction of its time in motion in which it
+    brakes.
     """
     acting = record.time_s >= float(record.initial.latency_s[0, VEHICLE_2_COLUMN])
     command, moving = record.command_mps2[acting, VEHICLE_2_COLUMN], record.speeds_mps[acting, VEHICLE_2_COLUMN] > 0.0

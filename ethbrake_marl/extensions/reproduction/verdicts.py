@@ -1,7 +1,7 @@
 """Verdicts on the claims of the paper, and the table that lists them.
 
-Its columns are: a claim of the paper, our result with the parameters as stated, our result in the *nearest reading*
-(the interpretation of the paper that comes nearest to its numbers), and the verdict with a reason.
+The table's columns are: a claim of the paper, our result with the parameters as stated, our result in the *nearest
+reading* (the interpretation of the paper that comes nearest to the printed numbers), and the verdict with a reason.
 
 The *chance difference* is the largest difference (95 %) that chance alone causes between the means of two random lists
 of worlds: sqrt(2) times half the width of the 95 % interval. The verdict on a printed number is the first that applies:
