@@ -119,7 +119,10 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         return TensorDict(content, batch_size=self.batch_size)
 
     def render(self, mode: str = "rgb_array") -> Any:
-        """Picture of the first world, or what another render mode shows. Only the ``mode`` of the first call counts."""
+        """What the render mode ``mode`` shows of the first world, by default a picture.
+
+        Later calls ignore ``mode``: the mode of the first call stays.
+        """
         if self.renderer is None:
             self.renderer = make_renderer(self, mode)
             self.renderer.began(self.episode.take([0]))
@@ -148,7 +151,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     @property
     def scenario(self) -> Scenario:
-        """Scenario in ``config``, where it may be replaced by another scenario, its name, or the path of its file."""
+        """Scenario of the task: ``config["scenario"]``, which may also be a name or the path of a file."""
         return load_scenario(self.config["scenario"])
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:

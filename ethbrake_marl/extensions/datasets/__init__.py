@@ -2,7 +2,7 @@
 
 An agent's command is a float64 number in m/s2, but a learner's action is a float32 number in [-1, 1]. So each world is
 simulated twice: first the agent drives, and its commands are rounded to actions; then learners take these actions. The
-file contains the second episode. An environment that gets the recorded actions repeats it bit for bit.
+file contains the second episode. An environment that gets the recorded actions repeats this episode bit for bit.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def rounded_actions(team: Team, game: Game, alert: State) -> list[Observations]:
 def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator[dict[str, Any]]:
     """Rows of the file, as columns: for each decision, name -> one value for each world whose episode has not ended.
 
-    ``actions``: actions of the L learners, [n, L] for each decision; learners repeat the last ones.
+    ``actions``: actions of the L learners, [n, L] for each decision; then learners repeat their last actions.
     """
     state, learners = game.reset(alert), game.settings.learners.tolist()
     while not state.ended.all():

@@ -224,10 +224,10 @@ LAWS: dict[str, Law] = {
 class Controller:
     """Agent that follows a ``Law``.
 
-    Its memory is the time of the danger to which it reacts, [n] s: infinite if there is none, NaN before the first
-    decision. The reaction time begins when the agent notices the danger; for a danger at the first decision it begins
-    at the alert, so it overlaps with the latency. The reaction ends with the danger, unless ``law.stays``; the next
-    danger starts a new reaction.
+    Its memory is the time at which the present danger began, [n] s: infinite without a danger, NaN before the first
+    decision. A danger begins when the law notices it, and then the vehicle's reaction time begins. A danger at the
+    first decision begins at the alert, so its reaction time overlaps with the latency. A danger ends when the law no
+    longer notices it or, if ``law.stays``, never.
     """
 
     knows = MESSAGES
@@ -251,8 +251,8 @@ class Controller:
     def act(self, state: State, memory: Floats, body: int) -> tuple[Floats, Floats]:
         """Commands of the vehicle ``body``, [n] m/s2, and the new memory.
 
-        If the law notices dangers, the vehicle coasts without one. Between perception and the end of the reaction time
-        it decelerates by at least ``release`` (m/s2).
+        If the law notices dangers, the vehicle coasts while there is none. Between perception and the end of the
+        reaction time it decelerates by at least ``release`` (m/s2).
         """
         motion, p = KnownMotion.of(state, body, self.step_s), self.parameters
         command = self.law.command(motion, p)

@@ -147,9 +147,9 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
 def write_features(scratch, has_impact, i, first, last, time_step_s, value):
     """Write the features of one forecast for body i to ``value``; features of an unknown pair are 0.
 
-    ``scratch``: results of the simulation. ``has_impact``: whether the simulation contains an impact. ``first``,
-    ``last``: first and last known body. An impact exactly at the end of a time step belongs to this step, as in the
-    episode.
+    ``scratch``: results of the forecast's simulation. ``has_impact``: whether this simulation contains an impact.
+    ``first``, ``last``: first and last known body. An impact exactly at the end of a time step belongs to this step, as
+    in an episode.
     """
     for side in range(2):
         p, impact = i - 1 + side, value[side * PER_SIDE : (side + 1) * PER_SIDE]

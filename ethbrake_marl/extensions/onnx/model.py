@@ -57,8 +57,9 @@ def to_onnx(policy: Policy) -> bytes:
             return node("Tanh", [x])
         if spec.output == "clip":
             return node("Clip", [x, *bounds])
-        nothing = node("Mul", [node("ReduceMax", [x], axes=[1], keepdims=1), zero])  # [n, 1]
-        actions = node("Add", [nothing, constant("choices", spec.actions[np.newaxis])])
+        # [n, 1]: repeats the choices in every row
+        zeros = node("Mul", [node("ReduceMax", [x], axes=[1], keepdims=1), zero])
+        actions = node("Add", [zeros, constant("choices", spec.actions[np.newaxis])])
         return node("GatherElements", [actions, node("ArgMax", [x], axis=1, keepdims=1)], axis=1)
 
     action = node("Identity", [actor()], output="action")

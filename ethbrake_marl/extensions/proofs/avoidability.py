@@ -84,7 +84,7 @@ class Avoidability(NamedTuple):
 def spare_gap(gap, v_l, a_l, v_f, a_f):
     """Smallest gap (m) between follower and leader if both brake fully from now on; negative: they make contact.
 
-    If the follower comes to rest last, it is the gap at rest. Otherwise the gap is smallest when both speeds are equal,
+    The gap is smallest at rest if the follower comes to rest last. Otherwise it is smallest when both speeds are equal,
     or now if the leader is at least as fast. ``gap``: present gap (m). v (m/s), a (m/s2): speed and braking capacity of
     leader (l) and follower (f).
     """
@@ -165,7 +165,7 @@ def had_impact(gap, closing):
 
 @kernel
 def plan_behind(at, ahead, v_l, out):
-    """Plan (see the file ``plans``) of the largest trajectory: drive fully, brake fully, follow the front vehicle.
+    """Plan (file ``plans``) of the largest trajectory (top of this file): drive fully, brake fully, follow the leader.
 
     Also writes the columns DRIVE, TOUCH and FOLLOW of ``out`` (see ``decide``). ``at``: one world (columns: file
     ``line``). At the start of the plan the front vehicle is ``ahead`` (m) and has the speed ``v_l`` (m/s).

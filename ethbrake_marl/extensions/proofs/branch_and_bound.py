@@ -61,8 +61,8 @@ def command_deviation(kind, at, early, late, softest, hard, begin):
     """Least difference (m/s2) between the command at a first contact and the best command after it.
 
     Braking makes a contact with the front vehicle gentle, but driving softens the impact from behind that follows; at
-    the rear it is the other way round. The command is the same in the whole decision step, which starts at ``begin``
-    (s), so it cannot be the best one both before and after the contact. ``softest`` is the smallest closing speed (m/s)
+    the rear it is the other way round. A command lasts for the whole decision step, which starts at ``begin`` (s), so
+    the same command cannot be best both before and after the contact. ``softest`` is the smallest closing speed (m/s)
     of a first contact between ``early`` and ``late`` under any command. Other arguments: package ``proofs``.
     """
     command_range = at[U_F] + at[A_F]

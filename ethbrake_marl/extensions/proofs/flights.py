@@ -23,10 +23,10 @@ def flight_lead(pair, opening, flight):
     """*Lead* of a flight: the speed (m/s) that the controlled vehicle gains, minus the speed that it gives up.
 
     The gain is its speed minus the speed of the centre of mass of the pair. For a flight of L seconds (``flight``) with
-    the opening speed o, the lead is ``share (press L - o) - G``. G is the speed (m/s) that the vehicle must give up so
-    that the two stay apart for the time L: the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``,
-    because in each second it can give up at most ``reach``. The result is -inf if no command keeps the two apart for so
-    long. ``pair``: top of this file.
+    the opening speed o, the lead is ``share (press L - o) - G``. G is the speed (m/s) that the vehicle must give up to
+    stay apart from its partner for the time L. It is the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o
+    L``, because the vehicle can give up at most ``reach`` in each second. The result is -inf if no command keeps the
+    two apart for so long. ``pair``: top of this file.
     """
     share, press, reach, _ = pair
     relative = share * (press * flight - opening)
@@ -40,9 +40,10 @@ def flight_lead(pair, opening, flight):
 
 @kernel
 def best_flight(pair, opening):
-    """Duration (s) of the flight with the largest lead, for one speed of separation ``opening`` (m/s).
+    """Duration (s) of the flight with the largest lead (``flight_lead``).
 
-    The duration is infinite if a longer flight always has a larger lead. ``pair``: top of this file.
+    It is infinite if a longer flight always has a larger lead. ``opening``: speed at which the two separate (m/s).
+    ``pair``: top of this file.
     """
     share, press, reach, _ = pair
     if press <= 0.0:
@@ -61,9 +62,9 @@ def best_flight(pair, opening):
 
 @large
 def lead(pair, opening, shortest, longest, lost):
-    """Largest lead (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
+    """Largest lead (m/s) of all flights that last from ``shortest`` to ``longest`` seconds (``flight_lead``).
 
-    The maximum is over all speeds of separation up to ``opening`` (m/s), because in a limited time a smaller one may
+    The maximum is over all speeds of separation up to ``opening`` (m/s), because in a limited time a smaller speed may
     give a larger lead. ``pair``, ``lost``: top of this file.
     """
     share, press, reach, _ = pair
@@ -109,10 +110,9 @@ def largest_lead(pair, opening, lost, late, end, since, until):
     reality the command of the earlier decision still applies in the *window*, the rest of the decision step from
     ``late`` to ``end``, and there the vehicle loses the speed ``lost``.
 
-    The pair's last flight before the controlled vehicle touches its second neighbour, the one outside the pair, begins
-    with the first impact, within the window, or after it; the bound is the maximum over these three cases. The second
-    neighbour is touched between ``since`` and ``until``. Times are in s after the first contact. ``pair``, ``opening``:
-    top of this file.
+    The controlled vehicle touches its second neighbour, the one outside the pair, between ``since`` and ``until``. The
+    pair's last flight before this begins with the first impact, within the window, or after the window; the bound is
+    the maximum over these three cases. Times are in s after the first contact. ``pair``, ``opening``: top of this file.
     """
     share, press, reach, bounce = pair
     if since < end:
@@ -135,10 +135,10 @@ def largest_lead(pair, opening, lost, late, end, since, until):
 
 @kernel
 def widest_flight(share, slack, press, drive, bounce, closing, back, time):
-    """Largest ``sqrt(p^2 + 2 press s)`` (m/s) in the flights from a partner that brakes harder.
+    """Upper bound (m/s) on ``sqrt(p^2 + 2 press s)`` in all flights from a partner that brakes harder.
 
     p is the speed (m/s) at which vehicle and partner separate, s the gap (m) between them. The bound holds for ``time``
-    seconds; it is infinite if none is known. ``slack``: braking capacity of the partner minus the vehicle's (m/s2).
+    seconds; infinite: no bound is known. ``slack``: braking capacity of the partner minus the vehicle's (m/s2).
     ``drive``: the vehicle's largest acceleration (m/s2). ``closing``: closing speed of the first impact (m/s).
     ``back``: backward speed of the vehicle after this impact (m/s). Other arguments: top of this file.
     """

@@ -1,9 +1,9 @@
 """Lower bounds on the harm with the second neighbour after a first contact with the first neighbour.
 
-The time and the closing speed of the first contact determine the state of all three vehicles. After it the extreme
-command (full drive or full braking) is best for the centre of mass of the two vehicles in contact. The controlled
-vehicle moves faster or slower than this centre only until it meets the first neighbour again; ``flights.largest_lead``
-bounds the difference.
+The time and the closing speed of the first contact determine the state of all three vehicles. After this contact the
+extreme command (full drive or full braking) is best for the centre of mass of the two vehicles in contact. The
+controlled vehicle moves faster or slower than this centre only until it meets the first neighbour again;
+``flights.largest_lead`` bounds the difference.
 
 Each function computes one bound for all first contacts between the times ``early`` and ``late``, from the state at
 ``early``. From ``late`` to ``end`` the command of the earlier decision still applies.
@@ -83,8 +83,8 @@ def least_closing(line, pair, opening, lost, late, end, until):
 def rear_after(at, early):
     """Rear vehicle at ``early`` (s): its distance to the leader (m), its speed (m/s) and its onset (s).
 
-    The *onset* is the time from ``early`` until the rear vehicle begins to brake. The length of the controlled vehicle
-    does not count. ``at``: one world (columns: file ``line``).
+    The *onset* is the time from ``early`` until the rear vehicle begins to brake. The distance leaves out the length of
+    the controlled vehicle. ``at``: one world (columns: file ``line``).
     """
     speed, way = follower(at, early)
     return max(at[GAP_L] + at[GAP_R] + leader(at, early)[1] - way, 0.0), speed, max(at[ONSET_R] - early, 0.0)
@@ -97,30 +97,33 @@ def pushed_by_leader(at, early, late, closing, end, lack):
     1. The *block*, leader and controlled vehicle together, moves like its centre of mass: at first with ``speed`` and
        the acceleration ``push``, until the leader stands at ``stand``.
     2. The rear vehicle has reached the block by the time ``until``. The result is 0 if it need not reach the block.
-    3. The bound is the speed at which the rear vehicle closes in on the block, minus the largest amount by which the
-       controlled vehicle may then be faster than the block.
+    3. The bound is the speed at which the rear vehicle closes in on the block, minus the largest lead in speed that the
+       controlled vehicle can have over the block at that time.
 
     Arguments: package ``proofs``.
     """
-    share, rest, press, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L], at[BOUNCE]
+    # press: acceleration with which the controlled vehicle gains on the leader under full drive
+    leader_share, own_share, press, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L], at[BOUNCE]
     v_l = leader(at, early)[0]
     behind, v_r, onset = rear_after(at, early)
     if v_l <= 0.0:  # a later contact with a leader at rest leads to the same motion, only later
         late, end, lack = early, early, 0.0
     late, end, lost = late - early, end - early, lack * (end - late)
-    speed, push = v_l + rest * closing, rest * at[U_F] - share * at[A_L]
-    stand = (speed + rest * bounce * closing) / at[A_L]
-    block = with_window(push, late, end, -rest * lack, stand, share * at[A_L])
+    # 1. the block
+    speed, push = v_l + own_share * closing, own_share * at[U_F] - leader_share * at[A_L]
+    stand = (speed + own_share * bounce * closing) / at[A_L]
+    block = with_window(push, late, end, -own_share * lack, stand, leader_share * at[A_L])
+    # 2. the rear vehicle reaches it
     until = walk(behind, speed, block, v_r, braking(onset, at[A_R]), onset + v_r / at[A_R])[1]
     if until == math.inf:
         return 0.0
-    # finite if the leader still moves until then, however soft the impact
-    pair = share, press, (at[U_F] + at[A_F] if until * at[A_L] <= v_l else math.inf), bounce
+    # 3. the bound; ``reach`` is finite if the leader still moves until then, however soft the impact
+    pair = leader_share, press, (at[U_F] + at[A_F] if until * at[A_L] <= v_l else math.inf), bounce
     if v_l <= 0.0:
         slowest = max(v_r - at[A_R] * max(until - onset, 0.0), 0.0)
-        least = least_of_line((slowest - speed, -push, 0.0, 0.0, stand, -share * at[A_L]), 0.0, until)
+        least = least_of_line((slowest - speed, -push, 0.0, 0.0, stand, -leader_share * at[A_L]), 0.0, until)
         return max(least - largest_lead(pair, bounce * closing, 0.0, 0.0, 0.0, 0.0, until), 0.0)
-    line = v_r - speed, -push, onset, -at[A_R], stand, -share * at[A_L]
+    line = v_r - speed, -push, onset, -at[A_R], stand, -leader_share * at[A_L]
     return least_closing(line, pair, bounce * closing, lost, late, end, until)
 
 
@@ -201,8 +204,9 @@ def braking_after(gap, least_gap, v_l, a_l, v_f, a_f):
 def pushed_by_rear(at, early, late, closing, end, lack, gap):
     """Lower bound (m/s) on the front pair's closing speed after a first contact with the rear vehicle.
 
-    It follows from the motion of the centre of mass of the rear pair. The controlled vehicle must brake at least as
-    hard as the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m). Other arguments: package ``proofs``.
+    The bound follows from the motion of the centre of mass of the rear pair. It holds only if the controlled vehicle
+    has at least the braking capacity of the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m). Other
+    arguments: package ``proofs``.
     """
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -224,20 +228,20 @@ def pushed_by_rear(at, early, late, closing, end, lack, gap):
 def after_rear(at, early, late, closing, end, lack):
     """Lower bound (m2/s2) on the front pair's squared closing speed after a first contact with the rear vehicle.
 
-    It is the larger of two lower bounds: one for braking alone, one for the push from behind. Arguments: package
+    The larger of two bounds: one considers braking alone, the other the push from behind. Arguments: package
     ``proofs``.
     """
-    share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
+    rear_share, own_share, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
-    speed = v_r - rest * closing
-    if share * (1.0 + bounce) <= 1.0:
-        speed += share * bounce * closing
+    speed = v_r - own_share * closing
+    if rear_share * (1.0 + bounce) <= 1.0:  # then the hardest impact leaves the vehicle slowest
+        speed += rear_share * bounce * closing
     speed = max(speed - max(at[A_R] - at[A_F], 0.0) * (late - early), 0.0)
     gap = max(at[GAP_L] + at[GAP_R] + way_l - way_r, 0.0)
-    least = gap - max(follower(at, late)[1] - way_r - (leader(at, late)[1] - way_l), 0.0)
-    squared = braking_after(gap, least, v_l, at[A_L], speed, at[A_F])
-    if at[A_F] >= at[A_R]:
+    least_gap = gap - max(follower(at, late)[1] - way_r - (leader(at, late)[1] - way_l), 0.0)
+    squared = braking_after(gap, least_gap, v_l, at[A_L], speed, at[A_F])
+    if at[A_F] >= at[A_R]:  # otherwise the rear vehicle falls behind and need not push
         pushed = pushed_by_rear(at, early, late, closing, end, lack, gap)
         squared = max(squared, pushed * pushed)
     return squared
@@ -247,8 +251,8 @@ def after_rear(at, early, late, closing, end, lack):
 def after(kind, at, early, late, closing, end, lack):
     """Lower bound (m2/s2) on the harm with the second neighbour that must follow a first contact.
 
-    ``kind`` says with which neighbour the first contact is, ``early`` to ``late`` (s) when, ``closing`` (m/s) with
-    which largest closing speed. Other arguments: package ``proofs``.
+    The first contact is with the neighbour ``kind``, between ``early`` and ``late`` (s), with a closing speed of at
+    most ``closing`` (m/s). Other arguments: package ``proofs``.
     """
     if kind == FRONT_FIRST:
         return after_front(at, early, late, closing, end, lack)

@@ -120,9 +120,10 @@ def rear_bound(at):
 def last_first(kind, at, first, last):
     """Latest time (s), at most ``last``, at which the first contact can be with the neighbour ``kind``.
 
-    Found by bisection, from the time ``first`` (s), at which such a contact is possible. For a later contact in front
-    the vehicle drives for a shorter time, so the rear vehicle comes nearer; for a later contact behind it brakes for a
-    shorter time, so it comes nearer to the front vehicle. ``kind``, ``at``: package ``proofs``.
+    Found by bisection, from the time ``first`` (s), at which such a contact is possible. The later the contact with the
+    front vehicle, the shorter the drive before it, and the nearer the rear vehicle comes. The later the contact with
+    the rear vehicle, the shorter the braking before it, and the nearer the front vehicle comes. ``kind``, ``at``:
+    package ``proofs``.
     """
     time = last
     for _ in range(HALVINGS + 1):
@@ -142,7 +143,7 @@ def last_first(kind, at, first, last):
 
 @large
 def last_meeting(at, first):
-    """Latest time (s) of a contact with the front vehicle, and the latest (s) before any contact with the rear vehicle.
+    """Latest time (s) of a contact with the front vehicle, and latest time (s) at which it can be the first contact.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
     speed. ``first`` is the earliest time (s) of a contact with the front vehicle. ``at``: one world (columns: file
@@ -184,7 +185,7 @@ def outer_contact(at):
 
 @large
 def front_first(at, floor, best, enough, cells):
-    """Lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front or of all three vehicles.
+    """Lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front, or of all three vehicles.
 
     In a contact of all three vehicles, the closing speeds of the two pairs add up to the closing speed of the rear
     vehicle relative to the front vehicle, and the closing speed of the front pair is at least the smallest possible one
@@ -247,7 +248,10 @@ def rear_first(at, floor, best, enough, cells):
 
 @kernel
 def last_rest(at):
-    """Time (s) after which no more harm happens that ``combined_bound`` counts, in the world ``at``."""
+    """Time (s) after which no harm that ``combined_bound`` counts can happen.
+
+    ``at``: one world (columns: file ``line``).
+    """
     stand = rest_of_rear(at)
     way = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, stand)[1]
     room = at[GAP_L] + at[V_L] * at[V_L] / (2.0 * at[A_L]) + at[GAP_R] - way
@@ -259,8 +263,8 @@ def last_rest(at):
 def combined_bound(at, until, front, rear, cells):
     """Lower bound (m2/s2) on the harm of both pairs together in a world with unavoidable contact.
 
-    0 if some of the counted harm may come after the horizon ``until`` (s). ``front`` and ``rear`` are lower bounds on
-    the harm of each pair alone (m2/s2). ``at``, ``cells``: package ``proofs``.
+    0 if harm that this bound counts may come after the horizon ``until`` (s). ``front`` and ``rear`` are lower bounds
+    on the harm of each pair alone (m2/s2). ``at``, ``cells``: package ``proofs``.
     """
     if not last_rest(at) < until:
         return 0.0
@@ -280,8 +284,8 @@ def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
     """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2): front pair, rear pair, both together.
 
     ``rows`` [n, LINE_COLUMNS]: the worlds (columns: file ``line``). Harm after ``until`` [n] (s) does not count.
-    ``has_front`` and ``has_rear`` [n]: whether this neighbour exists and the next impact with it counts.
-    ``unavoidable`` [n]: whether contact cannot be avoided. ``cells``: memory, overwritten.
+    ``has_front`` [n]: whether the front vehicle exists and the next impact with it counts; ``has_rear`` [n]: the same
+    for the rear vehicle. ``unavoidable`` [n]: whether contact cannot be avoided. ``cells``: memory, overwritten.
     """
     for k in range(len(out)):
         for column in range(BOUNDS):

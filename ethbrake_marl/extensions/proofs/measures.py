@@ -21,8 +21,8 @@ from ethbrake_marl.registry import Part
 def avoidable(game: Game, alert: State, last: State) -> MeasureValue:
     """Whether some commands avoid all contact (proven), and if not, why: ``early``, ``front`` or ``rear``.
 
-    The commands are those of Vehicle 2 of three (or of Vehicles 2 and 3 together) or of either of two vehicles; all
-    others brake fully. The result is the same for every agent.
+    The proof covers lines of three vehicles in which Vehicle 2 learns, or Vehicles 2 and 3, and lines of two vehicles
+    in which one learns. All others must brake fully. The result is the same for every agent.
     """
     verdict = avoidability(alert, _controlled_body(game, alert, together=True))
     return {"": verdict.avoidable, "reason": verdict.reason_name}

@@ -80,7 +80,7 @@ def braked_then_driven(at, brake, time):
 
 @large
 def braking_to_rear(at, time):
-    """Time (s) for which the vehicle must brake, before it drives, to meet the rear vehicle at ``time`` (s).
+    """Time (s) for which the controlled vehicle must brake, before it drives, to meet the rear vehicle at ``time`` (s).
 
     ``at``: one world (columns: file ``line``).
     """
@@ -99,9 +99,9 @@ def braking_to_rear(at, time):
 def gentlest(kind, at, time):
     """Smallest closing speed (m/s) of a first contact at ``time`` (s), and the duration of the first phase (s).
 
-    For a contact in front the vehicle drives first and then brakes: it arrives with the smallest possible speed. For a
-    contact behind it brakes first and then drives, and arrives with the largest; the duration is then infinite if it
-    reaches its speed limit. ``kind``, ``at``: package ``proofs``.
+    Before a contact in front, the vehicle drives and then brakes: it arrives with the smallest possible speed. Before a
+    contact behind, the vehicle brakes and then drives: it arrives with the largest possible speed. If this is its speed
+    limit, the duration is infinite. ``kind``, ``at``: package ``proofs``.
     """
     if kind == FRONT_FIRST:
         return gentlest_front(at, time)
@@ -150,7 +150,7 @@ def rest_of_rear(at):
 
 @large
 def meet_front(at, drive):
-    """Time (s) at which the vehicle meets the front vehicle if it drives for ``drive`` s, then brakes; infinite: never.
+    """Time (s) at which a vehicle that drives for ``drive`` s, then brakes, meets the front vehicle; infinite: never.
 
     ``at``: one world (columns: file ``line``).
     """
@@ -159,7 +159,7 @@ def meet_front(at, drive):
 
 @large
 def meet_rear(at, brake):
-    """Time (s) at which the rear vehicle meets the vehicle if it brakes for ``brake`` s, then drives; infinite: never.
+    """Time (s) at which the rear vehicle meets a vehicle that brakes for ``brake`` s, then drives; infinite: never.
 
     ``at``: one world (columns: file ``line``).
     """

@@ -83,9 +83,10 @@ def walk(gap, v_front, front, v_rear, rear, until):
     """Smallest gap of two vehicles (m), time (s) of their first contact, and its squared closing speed (m2/s2).
 
     The vehicles begin with the gap ``gap`` (m) and the speeds ``v_front`` and ``v_rear`` (m/s, at least 0), and follow
-    the plans ``front`` and ``rear`` until ``until`` (s), as if they could pass through each other: a negative smallest
-    gap is the depth of their overlap. Without contact the time is infinite and the square 0. A gap that reaches 0 and
-    opens again is no contact; one that reaches 0 and would become negative is, even at closing speed 0.
+    the plans ``front`` and ``rear`` until ``until`` (s). They move as if they could pass through each other: a negative
+    smallest gap is the depth of their overlap. Without contact the time is infinite and the square 0. A gap that
+    reaches 0 and opens again is no contact. A gap that reaches 0 and would become negative is a contact, even at
+    closing speed 0.
     """
     lowest, now, met_at, squared = gap, 0.0, math.inf, 0.0
     while now < until:

@@ -81,9 +81,9 @@ def scenario_from_data(
 ) -> FromData:
     """Create a scenario from the recordings in a folder and its subfolders; each world is a recorded chain of vehicles.
 
-    At regular times, each queue (vehicles that follow each other) is cut, from its front vehicle on, into chains of as
-    many vehicles as the scenario ``based_on`` has. The gaps and speeds of a chain are one row. If there are more rows
-    than a scenario's table may have, only every k-th row is used.
+    At regular times, each queue (vehicles that follow each other) is cut into chains, from its front vehicle on. A
+    chain has as many vehicles as the scenario ``based_on``. The gaps and speeds of a chain are one row of the new
+    scenario's table. If there are more rows than a table may have, only every k-th row is used.
 
     Args:
         name: name of the scenario.
@@ -138,7 +138,8 @@ def read_chains(
     """Chains of ``vehicles`` vehicles in all recordings of a folder and its subfolders, or in one file.
 
     Chains are formed every ``every_s`` seconds. A file with an error is refused as a whole; a copy of another file is
-    skipped. Raises ``InvalidInput`` if there is no recording of the format ``entry``, or no chain.
+    skipped. ``progress``: as in ``scenario_from_data``. Raises ``InvalidInput`` if there is no recording of the format
+    ``entry``, or no chain.
     """
     longest, left_out, refused, skipped = 0, Counter[str](), list[str](), list[str]()
     numbers, of, digests, format_errors = (

@@ -77,10 +77,11 @@ def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
 
 
 def moments(times_s: Floats, every_s: float) -> Floats:
-    """For each recorded time, the number k of the moment for which it is used, or -1: it is left out; [rows] floats.
+    """Number of the moment for which each recorded time is used, [rows] floats; -1: the recorded time is not used.
 
-    Moment k is ``min(times_s) + k every_s``. The nearest recorded time is used for it, if it is at most half the
-    smallest step between recorded times away. Raises ``InvalidInput`` if ``every_s`` is less than that step.
+    Moment k is the time ``min(times_s) + k every_s``. It uses the nearest recorded time that is at most half a
+    recording step away. The recording step is the smallest difference between recorded times. Raises ``InvalidInput``
+    if ``every_s`` is less than the recording step.
     """
     recorded, back = np.unique(np.round(times_s - times_s.min(), 6), return_inverse=True)
     step = np.diff(recorded).min(initial=every_s if len(recorded) == 1 else np.inf)

@@ -37,9 +37,10 @@ def film_scenes(world: State, team: Team, game: Game) -> list[Scene]:
 def film(world: State, teams: Mapping[str, Team], ending: str, game: Game) -> bytes:
     """Films of teams that drive the same world, one below the other, as the content of one file.
 
-    ``teams``: title -> team. A film that ends early shows its last scene until all have ended. ``ending``: ``.gif`` or
-    ``.mp4``; or ``.png`` for stills of three moments: the alert, the hardest impact under any team, and the end. Raises
-    ``InvalidInput`` for any other ending, and ``MissingExtra`` for ``.mp4`` if imageio-ffmpeg is not installed.
+    ``teams``: title -> team. A film that ends early shows its last scene until all films have ended. ``ending``:
+    ``.gif`` or ``.mp4``; or ``.png`` for stills of three moments: the alert, the hardest impact under any team, and the
+    end. Raises ``InvalidInput`` for any other ending, and ``MissingExtra`` for ``.mp4`` if imageio-ffmpeg is not
+    installed.
     """
     check_film(ending)
     films = {title: film_scenes(world, team, game) for title, team in teams.items()}

@@ -182,7 +182,7 @@ class Motion:
 def whole_road(state: State, row: int) -> tuple[float, float]:
     """Both ends (m) of the road that the line needs until it rests, if all vehicles brake fully as soon as they can.
 
-    If a rear vehicle would stop farther ahead than the vehicles before it, it is taken to push them that far.
+    A vehicle that would stop farther ahead than the vehicles before it is assumed to push them that far.
     """
     speeds, braking = state.speeds_mps[row], state.braking_capacity_mps2[row]
     behind = np.concatenate([[0.0], np.cumsum(state.gaps_m[row])])

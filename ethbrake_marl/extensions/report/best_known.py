@@ -54,7 +54,7 @@ class BestKnown(NamedTuple):
 def shown_counts(compared: Compared) -> dict[str, str]:
     """Counts to show, count -> column: first-impact harm, total harm, and the count that agents minimise.
 
-    The last one is left out if the best known harm is known only for others.
+    The count that agents minimise is left out if the best known harm has been measured for other counts only.
     """
     best_known, minimised = BestKnown.of(compared.result), compared.harm_count
     return (

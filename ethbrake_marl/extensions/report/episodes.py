@@ -33,9 +33,9 @@ def player(
 ) -> Markup:
     """Player of the episodes of all agents in some worlds, as HTML.
 
-    At first it shows at most three agents: ``focus`` (the agent that the page is about), the first and the last.
-    ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, sampled
-    every ``MOTION_SAMPLE_S`` seconds.
+    At first the player shows at most three agents: ``focus`` (the agent that the page is about), the first and the
+    last. ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds,
+    sampled every ``MOTION_SAMPLE_S`` seconds.
     """
     result, agents, worlds = compared.result, list(records), list[dict[str, Any]]()
     for (row, kind), *episodes in zip(kinds.items(), *records.values(), strict=True):
@@ -166,7 +166,8 @@ def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
 def worst_rows(compared: Compared, focus: str) -> Ints:
     """Rows of the worlds in which ``focus`` did worst, worst first, at most ten.
 
-    Worst: by the count that agents minimise, minus its best known value if there is one. Only values above 0.
+    A world is worse if the count that agents minimise, minus its best known value if there is one, is larger. Worlds in
+    which this difference is not above 0 are left out.
     """
     result, count, best_known = compared.result, compared.harm_count, BestKnown.of(compared.result)
     best = 0.0 if best_known is None else best_known.harm.get(count, 0.0)
@@ -180,10 +181,10 @@ def rows_by_value(value: Floats, among: Bools) -> Ints:
 
 
 def episodes_section(compared: Compared, focus: str, kinds: dict[int, str]) -> Section:
-    """Section with a player of the worlds ``kinds`` (row -> why it is shown), in which every team drives once more.
+    """Section that plays back the worlds ``kinds`` (row -> why it is shown).
 
-    ``focus``: the agent that the page is about. A note names every agent whose harm in these episodes differs from its
-    harm in the evaluation.
+    Every team drives these worlds again. A note names every agent whose harm now differs from its harm in the
+    evaluation. ``focus``: the agent that the page is about.
     """
     rows, worlds, (_, game) = [*kinds], compared.worlds(kinds), open_game(compared.scenario)
     records = {agent: record_episodes(worlds, team, game, MOTION_SAMPLE_S) for agent, team in compared.teams.items()}

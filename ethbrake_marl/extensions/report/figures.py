@@ -57,7 +57,7 @@ EstimateCurve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by sid
 def curve_over_seeds(trainings: Sequence[Mapping[Any, float]]) -> EstimateCurve:
     """Mean of several training runs, with an interval of one standard deviation over the seeds on both sides.
 
-    ``trainings``: for each run, step or progress -> value. The curve has the steps that all runs share.
+    ``trainings``: for each run, step or progress -> recorded value. The curve has the steps that all runs share.
     """
     curve = {}
     for step in sorted(set.intersection(*map(set, trainings))):
@@ -375,7 +375,7 @@ def write_worlds(path: Path, scenario: Scenario, episodes: int, *, seed: int, fo
 def worlds_figure(scenario: Scenario, drawn_worlds: DrawnWorlds, *, seed: int) -> Figure:
     """Draw the distribution of each quantity that differs between worlds, and three worlds at the alert.
 
-    These have the smallest, the median and the largest sum of gaps.
+    The three worlds have the smallest, the median and the largest sum of gaps.
     """
     varying = _varying_quantities(drawn_worlds)
     columns = min(max(len(varying), 1), ABREAST)

@@ -163,7 +163,7 @@ def measure_parts(agents: SummaryTable) -> list[Markup]:
 def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> Section:
     """Section with a table of the worlds in which ``focus`` did worst, at most ten.
 
-    ``watched``: rows of the worlds in the player; they get a button that starts it.
+    ``watched``: rows of the worlds that the page can play back; these rows get a button that starts the player.
     """
     result, known_best, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
     counts = {**HARM, minimised: COLUMN[minimised]}

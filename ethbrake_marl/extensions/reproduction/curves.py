@@ -185,7 +185,10 @@ def reproduce_delays(settings: ReproductionSettings) -> Made:
 
 
 def reproduce_illustration(settings: ReproductionSettings) -> Made:
-    """Fig. 8: harm over the distance, and in how many worlds the hybrid does not pick the strategy of lower harm."""
+    """Fig. 8: harm over the sum of both gaps at the alert, and verdict on the hybrid.
+
+    The verdict says in how many worlds the hybrid does not pick the strategy of lower harm.
+    """
     readings = distances(settings, {ALONE: unconverged_policy(settings.folder)})
     hybrid = f"Hybrid {ALONE}"
     counts, shares, texts = [], [], []

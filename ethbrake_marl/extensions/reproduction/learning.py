@@ -115,7 +115,8 @@ def unconverged_policy(folder: Path) -> str:
 def process(settings: ReproductionSettings, group: str = RANDOM) -> dict[str, list[str]]:
     """Agent names of policies trained as in the paper: ``PPO`` and ``SAC`` -> one agent name for each seed.
 
-    ``group``: group of trainings. Empty unless ``settings.full``; without algorithms that have unfinished trainings.
+    ``group``: which trainings, such as ``RANDOM``. Empty unless ``settings.full``. An algorithm with an unfinished
+    training is left out.
     """
     runs = finished_runs(settings.folder, group) if settings.full else {}
     return {
@@ -141,12 +142,12 @@ class Course(NamedTuple):
 
     @property
     def values(self) -> Floats:
-        """Mean returns of training episodes, [seeds, k], at k values of the progress."""
+        """Mean return of training episodes at k points of the training, [seeds, k]."""
         return np.array([[*curve.values()] for curve in self.returns])
 
     @property
     def late(self) -> Floats:
-        """Returns in the last quarter of the training, [seeds, at least 2]."""
+        """The ``values`` in the last quarter of the training, [seeds, at least 2]."""
         return self.values[:, -max(self.values.shape[1] // 4, 2) :]
 
     @property
@@ -277,8 +278,8 @@ def judge_courses(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> li
 def convergence_claim(courses: Mapping[str, Course], by_decisions: Claim) -> Claim:
     """Verdict on the statement that SAC converges faster than PPO: always "undecided".
 
-    The paper's axis is the progress (%) of trainings whose lengths it does not state. ``courses``: algorithm ->
-    learning curves. ``by_decisions``: the verdict if convergence is counted in decisions.
+    The paper's axis is the progress (%) of trainings, but the paper does not state their lengths. ``courses``:
+    algorithm -> learning curves. ``by_decisions``: the verdict if convergence is counted in decisions.
     """
     ends = {name: (course.converged.mean(), course.decisions) for name, course in courses.items()}
     text = ", ".join(f"{name} after {at:,.0f} of {total:,.0f} decisions" for name, (at, total) in ends.items())

@@ -9,8 +9,8 @@ command u, from sample n to sample n + 1, is
 where f(n) is its speed after the impacts of sample n. Where the gap of a pair is at most 0 and its closing speed above
 0, its speeds change by eq. (13). Where the paper leaves something open, this map chooses:
 
-* Impacts at one sample happen from the rear pair to the front pair, because the paper applies f1 after f3. The harm of
-  the front impact follows from the speeds after f3; the paper's J_harm uses the speeds before both impacts.
+* Impacts at one sample happen from the rear pair to the front pair, because the paper applies f1 (front pair) after f3.
+  The harm of the front impact follows from the speeds after f3; the paper's J_harm uses the speeds before both impacts.
 * The paper's f1 and f3 would pull overlapping vehicles together even while they separate. The text below eq. (13)
   requires a positive closing speed, and so does this map. As in the exact physics, a touch (a closing speed of at most
   1e-5 m/s) does no harm.
@@ -19,7 +19,7 @@ where f(n) is its speed after the impacts of sample n. Where the gap of a pair i
 * ``0 <= v <= v_max`` is a constraint on u in the paper: commands are limited so that the next sample satisfies it. An
   impact can leave a negative speed: brakes bring it back to 0 with the commanded deceleration. It can leave a speed
   above v_max: the engine then has no effect. A coasting vehicle keeps its speed in both cases.
-* Times are rounded, so a latency has elapsed at a sample that is at most 1e-6 of a step before its end.
+* Times are rounded, so a latency has elapsed at a sample that is at most 1e-6 of a step before the latency's end.
 
 With this map, the reward term ``collision`` is the paper's r_collision at the sample at which a step begins; an overlap
 at an episode's last sample does not count. The term ``risk`` is computed at the sample at which the step ends. As in
@@ -66,9 +66,9 @@ EXACT_ALONE = ("push", "drove", "still_moving")  # terms of a reward that the ma
 
 
 def exchange(line: Floats, car: Floats) -> None:
-    """Change the speeds of all pairs that overlap and close, by eq. (13), and count impacts and harm; all in place.
+    """Change by eq. (13) the speeds of vehicles that overlap and still approach; count impacts and harm; all in place.
 
-    With the closing speed w = v_{i+1} - v_i:
+    The pairs are treated one after the other, from the rear. With the closing speed w = v_{i+1} - v_i:
 
     v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})
     v_{i+1}+ = v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})
@@ -111,11 +111,11 @@ def sample(state: State, step_s: float) -> State:
 
 
 def paper_collision(params: RewardParams, before: State, step: Step, after: State) -> Floats:
-    """The paper's reward r_collision, [n]: minus ``k_energy w^2`` for every pair that overlaps at the sample.
+    """The paper's reward r_collision, [n]: minus ``k_energy w^2`` for every pair that overlaps as the time step begins.
 
-    w is the closing speed in the state ``before``, before the impacts at the sample; ``step`` and ``after`` are unused.
-    A pair counts at every sample at which it overlaps, even while it separates, because the paper's Gamma depends only
-    on the gap.
+    w is the closing speed in ``before``, that is, before the impacts at this instant; ``step`` and ``after`` are
+    unused. A pair counts in every step that begins with its overlap, even while it separates, because the paper's
+    collision indicator Gamma depends only on the gap.
     """
     speed, gap = before.line[:, SPEED], before.line[:, GAP]
     closing = np.diff(speed[:, 1:], axis=1)

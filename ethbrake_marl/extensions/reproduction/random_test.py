@@ -1,8 +1,9 @@
 """The paper's random test (``Table:Random``): collision rate and mean harm of its four strategies.
 
 A *reading* is one interpretation of the paper's text: a value for each quantity that the text leaves open
-(``readings``). Readings that share the values on which a simulation depends are simulated once. The paper's *hybrid*
-follows a policy where its harm is at most that of E-V2X-BM, called H*, and E-V2X-BM elsewhere.
+(``readings``). Readings that share the values on which a simulation depends are simulated once. H* is the harm
+of E-V2X-BM. The paper's *hybrid* follows a policy in the worlds in which the policy's harm is at most H*, and E-V2X-BM
+in all others.
 """
 
 from __future__ import annotations
@@ -97,10 +98,11 @@ def report_outcome(row: str, reading: Reading, episodes: int, spec: str = "") ->
 
 
 def algorithm_1(policy: RandomOutcome, baseline: RandomOutcome, bound: Floats, counted: str = "first") -> RandomOutcome:
-    """Outcome of the paper's hybrid: the policy's where its harm is at most ``bound``, elsewhere that of E-V2X-BM.
+    """Outcome of the paper's hybrid, which in each world follows either the policy or E-V2X-BM.
 
-    ``policy``, ``baseline``: outcomes of the policy and of E-V2X-BM. ``bound``: harm of E-V2X-BM, predicted or
-    simulated, [n] m2/s2. ``counted``: the harm to compare, ``first`` or ``total``.
+    It follows the policy where the policy's harm is at most ``bound``. ``policy``, ``baseline``: outcomes of the policy
+    and of E-V2X-BM. ``bound``: harm of E-V2X-BM, predicted or simulated, [n] m2/s2. ``counted``: the harm to compare,
+    ``first`` or ``total``.
     """
     follows = policy[counted] <= bound
     return {key: np.where(follows, policy[key], baseline[key]) for key in policy}
@@ -128,8 +130,8 @@ def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: i
     """Outcome if all vehicles brake fully or, with ``plans``, Vehicle 2 holds the deceleration that E-V2X-BM plans.
 
     ``worlds``: reading that defines the simulated worlds. ``plans``: reading that defines the worlds for which E-V2X-BM
-    plans. ``after_impact``: the vehicles of an impact brake on (``brakes on``) or coast from the next decision on
-    (``coasts``), or the episode ends (``ends``).
+    plans. ``after_impact``: what follows an impact. Its vehicles brake on (``brakes on``) or coast from the next
+    decision on (``coasts``), or the episode ends (``ends``).
     """
     if after_impact != "brakes on" and worlds.step_s is None:
         worlds = worlds._replace(others=(*worlds.others, ("time_step_s", SHORT_STEP_S)))
@@ -154,7 +156,7 @@ def plan(plans: Reading, episodes: int) -> ConstantDeceleration:
     """Deceleration of Vehicle 2 that E-V2X-BM chooses ([n] m/s2), and the harm that it predicts ([n] m2/s2).
 
     Both follow from the paper's closed form, without restitution and time steps. ``plans``: reading that defines the
-    worlds. If several decelerations have the least harm, its value ``star`` selects the smallest, the middle or the
+    worlds. If several decelerations have the least harm, ``plans.star`` selects the smallest, the middle or the
     largest.
     """
     latencies = () if plans.plans_as_stated else ("acts_s", "rear_s")

@@ -81,7 +81,7 @@ def number_claims(
 
     ``stated``, ``nearest``: our outcomes with the paper's parameters as stated, and under the interpretation of the
     paper whose results come nearest to the printed ones. ``least``: proven lower bound on the harm with the parameters
-    as stated, [n] m2/s2. ``not_ours``: the policies are the user's.
+    as stated, [n] m2/s2. ``not_ours``: whether the user has replaced the shipped policies.
     """
     claims, proven = [], {RATE: rate(least > 0.0), AVERAGE: mean(least)}
     for row in printed:

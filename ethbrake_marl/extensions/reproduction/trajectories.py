@@ -80,7 +80,7 @@ def all_records(settings: ReproductionSettings) -> dict[str, Records]:
     """Recorded episodes, reading -> (policy, scenario number) -> episode.
 
     Two readings: the paper's parameters as stated, and the interpretation of the paper whose results come nearest to
-    its own. After training by the paper's own recipes, also ``paper's process``: the first seed of each policy.
+    the printed ones. If policies were trained by the paper's process, also ``paper's process``: the first seed of each.
     """
     policies = tuple(settings.policies.items())
     records = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
@@ -136,12 +136,13 @@ def reproduce_accelerations(settings: ReproductionSettings) -> Made:
     text = "Command of Vehicle 2 over time, as the paper states the latencies and under other readings."
     figure = DrawnFigure("accelerations", "Acceleration profiles", text, profiles_figure(readings, text))
     for records in (readings["as stated"], readings["nearest reading"]):
-        smaller, larger = (policy_difference(records, k, "command_mps2") for k in PAPER_SCENARIOS)
+        in_1, in_2 = (policy_difference(records, k, "command_mps2") for k in PAPER_SCENARIOS)
         (first, ppo_changes, _), (_, sac_changes, braking) = (profile_of(records[name, 2]) for name in ("PPO", "SAC"))
+        # statement -> (what we measured, a number below 0 if the statement holds)
         parts.append(
             {
                 "profiles of PPO and SAC are more alike in Scenario 1 than in 2": (
-                    f"root mean square difference {smaller:.2f} m/s² against {larger:.2f} m/s²", smaller - larger,
+                    f"root mean square difference {in_1:.2f} m/s² against {in_2:.2f} m/s²", in_1 - in_2,
                 ),
                 "Scenario 2: PPO accelerates before it brakes": (f"first command {first:+.2f} m/s²", -first),
                 "Scenario 2: SAC decelerates throughout most of it": (
@@ -176,7 +177,7 @@ def reproduce_accelerations(settings: ReproductionSettings) -> Made:
 def resample_pair(records: Records, number: int, what: str, column: int) -> list[Floats]:
     """A recorded quantity under PPO and under SAC, [k] each, at the same k times.
 
-    ``number``: of the paper's scenario, 1 or 2. ``what``: attribute of ``EpisodeRecord``. ``column``: vehicle or pair,
+    ``number``: scenario of the paper, 1 or 2. ``what``: attribute of ``EpisodeRecord``. ``column``: vehicle or pair,
     from 0. After an episode has ended, its last value is repeated.
     """
     pair = [records[name, number] for name in ("PPO", "SAC")]
@@ -187,16 +188,17 @@ def resample_pair(records: Records, number: int, what: str, column: int) -> list
 def policy_difference(records: Records, number: int, what: str) -> float:
     """Root mean square over time of the difference between PPO and SAC in a recorded quantity of Vehicle 2.
 
-    ``number``: of the paper's scenario, 1 or 2. ``what``: attribute of ``EpisodeRecord``.
+    ``number``: scenario of the paper, 1 or 2. ``what``: attribute of ``EpisodeRecord``.
     """
     ppo, sac = resample_pair(records, number, what, VEHICLE_2_COLUMN)
     return float(np.sqrt(np.mean((ppo - sac) * (ppo - sac))))
 
 
 def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[Claim]:
-    """Verdicts on claims that one quantity is smaller than another in a single world.
+    """Verdicts on claims of the paper that one quantity is smaller than another in a single world.
 
-    ``readings``: as stated, then in the nearest reading: claim -> numbers in words, smaller quantity minus larger one.
+    ``readings``: results with the parameters as stated, then in the nearest reading. Each maps a claim to numbers in
+    words, and to the smaller quantity minus the larger one.
     """
     claims = []
     for text in readings[0]:
@@ -213,7 +215,8 @@ def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[
 def profile_of(record: EpisodeRecord) -> tuple[float, float, float]:
     """First command of Vehicle 2 (m/s2), sum of the absolute changes of its command (m/s2), and share of braking.
 
-    All after its latency. The share is the fraction of the time in motion in which it brakes.
+    Only the time after the vehicle's latency counts. The share is the fraction of its time in motion in which it
+    brakes.
     """
     acting = record.time_s >= float(record.initial.latency_s[0, VEHICLE_2_COLUMN])
     command, moving = record.command_mps2[acting, VEHICLE_2_COLUMN], record.speeds_mps[acting, VEHICLE_2_COLUMN] > 0.0

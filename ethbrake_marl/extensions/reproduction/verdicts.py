@@ -1,12 +1,12 @@
 """Verdicts on the claims of the paper, and the table that lists them.
 
-Its columns are: a claim of the paper, our result with the parameters as stated, our result in the *nearest reading*
-(the interpretation of the paper that comes nearest to its numbers), and the verdict with a reason.
+The table's columns are: a claim of the paper, our result with the parameters as stated, our result in the *nearest
+reading* (the interpretation of the paper that comes nearest to the printed numbers), and the verdict with a reason.
 
 The *chance difference* is the largest difference (95 %) that chance alone causes between the means of two random lists
 of worlds: sqrt(2) times half the width of the 95 % interval. The verdict on a printed number is the first that applies:
 
-- *cannot be* if a proven lower bound for every strategy is above it by more than the chance difference;
+- *cannot be* if a proven lower bound for every strategy is above the printed number by more than the chance difference;
 - *agrees* if our number is within 2 % of it;
 - *undecided* if our number is within the chance difference of it: too few worlds;
 - *differs* otherwise.
@@ -73,7 +73,10 @@ def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) 
 
 
 class Less(NamedTuple):
-    """Comparison of two quantities, the first of which is smaller according to the paper."""
+    """Comparison of two quantities, the first of which is smaller according to the paper.
+
+    ``both_are_0``: both quantities are 0 in every world, so there is nothing to compare.
+    """
 
     where: str
     difference: Estimate  # quantity that should be smaller, minus the larger one

@@ -44,11 +44,11 @@ class WeaknessMeasure(NamedTuple):
 
     @classmethod
     def of(cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: str = "first") -> WeaknessMeasure:
-        """Measure called ``name`` of an agent.
+        """The weakness measure ``name``, applied to an agent.
 
         ``against``: the rival, for ``regret`` only; None: the best known commands. Agents are names or objects, as for
-        ``eb.evaluate``. Raises ``InvalidInput`` for an unknown measure, if ``against`` has no effect, and if a name
-        means several agents; and the errors of ``teams_of``.
+        ``eb.evaluate``. Raises ``InvalidInput`` for an unknown measure, for a rival of another measure than ``regret``,
+        and if a name means several agents; and the errors of ``teams_of``.
         """
         if name not in WEAKNESS_MEASURES:
             raise unknown_name("measure", name, WEAKNESS_MEASURES)
