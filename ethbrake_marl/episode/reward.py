@@ -186,7 +186,9 @@ def reward_params(reward: Reward) -> RewardParams:
 
 
 class Rewarding(NamedTuple):
-    """A reward, prepared for use after each step: parameters, and functions of terms that the compiled step lacks."""
+    """A reward, prepared for use after each step: its parameters, and the functions for those of its terms that the
+    compiled step does not compute.
+    """
 
     params: RewardParams
     counted: tuple[str, ...]  # names of the terms whose weight is not 0

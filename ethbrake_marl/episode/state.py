@@ -253,7 +253,9 @@ def map_arrays(function: Callable[..., Any], memory: Any, *siblings: Any) -> Any
 
 
 def take(memory: Any, rows: Any) -> Any:
-    """A memory (``map_arrays``) of only the worlds in ``rows``. Slices are copied into the usual memory layout."""
+    """A copy of a memory (defined in ``map_arrays``; a state is one) with only the worlds ``rows``: a slice, numbers or
+    a mask [n].
+    """
     if isinstance(rows, slice):
         return map_arrays(lambda array: array[rows].copy(), memory)
     places = np.asarray(rows, None if len(rows) else np.int64)
@@ -294,10 +296,11 @@ def front_share(harm, front_mass, rear_mass):
 
 @kernel
 def split_world(pair_harm, mass, borne):
-    """Write the harm (m2/s2) that each vehicle of one world bears to ``borne`` [N].
+    """Split the harm of each pair between its two vehicles, in one world: write each vehicle's part (m2/s2) to
+    ``borne`` [N].
 
-    ``pair_harm`` [N + 1] is the harm of each pair (m2/s2), ``mass`` [N + 1] the mass of each body (t). Vehicle 1 bears
-    the whole harm of its impacts with the obstacle.
+    ``pair_harm`` [N + 1]: harm of each pair (m2/s2); pair 0 is the obstacle and Vehicle 1, which bears all of it.
+    ``mass`` [N + 1]: mass of each body (t).
     """
     rear = 0.0
     for p in range(1, len(borne)):

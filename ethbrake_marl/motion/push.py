@@ -70,9 +70,10 @@ def group_acceleration(car, scratch, body, last, toward, side, held):
 
 @large
 def gain(car, scratch, body, last, toward, side, side_jerk, held, duration):
-    """Integral of ``group_acceleration`` over ``duration`` (s), if brakes build up: a change of speed (m/s).
+    """Change of speed (m/s) from ``group_acceleration`` over ``duration`` (s), while brakes build up.
 
-    ``side_jerk`` is the row of ``scratch`` with the rates of the row ``side``.
+    ``side_jerk``: row of ``scratch`` with the rates (m/s3) at which the accelerations in row ``side`` change. Other
+    arguments: as for ``group_acceleration``.
     """
     count, mass, force, rate = 0, 0.0, 0.0, 0.0
     for i in range(body, last + toward, toward):

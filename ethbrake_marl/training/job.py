@@ -70,7 +70,9 @@ class Job(NamedTuple):
         return ""
 
     def result(self) -> dict[str, float]:
-        """Best evaluation of a finished training: its ``steps``, ``harm`` (the minimised metric), and ``MEASURED``."""
+        """Best evaluation of a finished training, as a dictionary: ``steps``, ``harm`` (the minimised metric), and each
+        metric named in ``MEASURED``.
+        """
         count = self.training.recipe.reward.harm_count
         evaluations = read_object(RunFolder(self.folder).status)["evaluations"]
         best = min(evaluations, key=lambda evaluation: deciding(evaluation, count))

@@ -294,10 +294,11 @@ class Scenario(ScenarioPart):
 
     @cached_property
     def sources(self) -> dict[str, list[dict[int, Any]]]:
-        """Sources of the values of each declared quantity: key -> entries, one per vehicle or pair, or one per world.
+        """Where the values of each declared quantity come from: key -> list with an entry for each vehicle or pair, or
+        a single entry for a quantity of the whole world.
 
-        An entry maps the number of each possible vehicle type (0 without types) to the source: a constant, a
-        distribution or a column of the table. ``sources["mass_t"]`` may be ``[{0: 2.0, 1: 9.5}, ...]``.
+        An entry maps each possible vehicle type, by number (0 without types), to a constant, a distribution or a column
+        of the table. ``sources["mass_t"]`` may be ``[{0: 2.0, 1: 9.5}, ...]``.
         """
         sources = {}
         for key, rule in QUANTITIES.items():

@@ -99,10 +99,10 @@ class News(NamedTuple):
     def speeds_and_ways(
         self, speed: Floats, wanted: Floats, onset: Floats, limit: Floats, time_s: Floats
     ) -> tuple[Floats, Floats]:
-        """Speeds (m/s) at ``time_s`` [n, 1], and ways (m) driven since the newest samples, [n, N + 1] each.
+        """Speeds (m/s) at ``time_s`` ([n, 1], s), and distances (m) driven since the newest samples; both [n, N + 1].
 
-        Contacts are left out. Bodies that are not located keep their ``speed`` [n, N + 1]. From ``onset`` (s after the
-        alert) on, located bodies accelerate with ``wanted`` (m/s2) up to the speed ``limit`` (m/s), [n, N + 1] each.
+        Contacts are ignored. Bodies that are not located keep their ``speed``. Located ones accelerate at ``wanted``
+        (m/s2) from ``onset`` (s after the alert), up to the speed ``limit`` (m/s). These four are [n, N + 1].
         """
         speed, way = np.where(self.located, self.sample[:, SAMPLE_SPEED], speed), np.zeros(speed.shape)
         move_on(speed, way, wanted, onset - self.at_s, limit, np.where(self.located, time_s - self.at_s, 0.0))

@@ -74,7 +74,9 @@ class EstimatedShield(StepShield):
         return applied, memory._replace(members=memory.members._replace(median=after))
 
     def possible_states(self, state: State, memory: StepShieldMemory) -> State:
-        """Median lines in place of the true states, with the present memories of the agents in ``state``."""
+        """The lines that the vehicle assumes (``MedianLine``), in place of the true states. The memories of its agents
+        are those in ``state``.
+        """
         median: State = memory.members.median
         agent_memories = {body: state.memories[body] for body in self.drivers if body in state.memories}
         return median._replace(memories={**median.memories, **agent_memories})

@@ -212,10 +212,10 @@ class Answer(NamedTuple):
 
 
 def with_optima(plan: Ablation, measured: Sequence[LevelResult], threads: int, tell: OnProgress) -> list[LevelResult]:
-    """Results with the joint optimum added at each level that has a learner.
+    """Results with the joint optimum added at each level that has a learner: the least known harm, also among the
+    trained teams and the commands found at other levels (``least_known``).
 
-    Levels whose worlds, learners and scripts are the same share one search. Finished parts of a search are read from
-    files.
+    Levels with the same worlds, learners and scripts share one search. Finished parts of a search are read from files.
     """
     tables: dict[bytes, BestHarmTable] = {}
     answers: dict[str, Answer] = {}
@@ -273,8 +273,9 @@ def can_imitate(imitator: Answer, original: Answer) -> Bools:
     """Whether the learners of ``imitator`` can give the commands of the learners of ``original``, in each world, [m].
 
     They can if each learner of ``original`` learns in ``imitator``, the scripted vehicles of ``imitator`` have the same
-    roles in both, lines and latencies are the same, and each decision time of ``original`` is also a decision time of
-    ``imitator``. Only ``imitator`` may have an obstacle, because the commands are simulated again in its worlds.
+    roles in both, lines and latencies (with the wait for the alert) are the same, and each decision time of
+    ``original`` is also a decision time of ``imitator``. Only ``imitator`` may have an obstacle, because the commands
+    are simulated again in its worlds.
     """
     imitator_scenario, original_scenario = imitator.scenario, original.scenario
     scripted = [name for name, role in imitator_scenario.roles.items() if role != "learner"]

@@ -198,14 +198,15 @@ class Drivers(NamedTuple):
 
     @staticmethod
     def of(scenario: Scenario, weights: Floats, names: Sequence[str], count: str) -> Drivers:
-        """Learners of ``scenario``, with the agents ``names`` for each row of ``weights`` [W, N].
+        """The learners of ``scenario``, and for each choice of weights (row of ``weights`` [W, N]) the agents
+        ``names``, made to minimise the weighted harm.
 
-        With several learners, ``alone`` contains each of them, with the agents that can drive it. ``count``: count of
-        harm that agents minimise.
+        With several learners, ``alone`` holds the same for each learner by itself while the others brake fully, with
+        only the agents that can drive it. ``count``: the count of harm that agents minimise.
         """
         chosen = [scenario.replace(harm_weight=row.tolist(), objective="preference") for row in weights]
         teams = [make_teams(names, variant, harm_count=count) for variant in chosen]
-        preferring = [(open_game(variant)[1], some) for variant, some in zip(chosen, teams, strict=True)]
+        preferring = [(open_game(variant)[1], agents) for variant, agents in zip(chosen, teams, strict=True)]
         alone = {}
         for body in scenario.learners if len(scenario.learners) > 1 else ():
             single = scenario.with_learners([scenario.vehicle_names[body - 1]])

@@ -53,11 +53,13 @@ LOOK_AHEAD = ("place", "speed", "braking_capacity", "latency", "mass")  # pieces
 
 
 def known_pieces(state: State, observer: int) -> Bools:
-    """Whether the body ``observer`` knows each quantity in ``PIECES`` of each body, [n, N + 1, PIECES].
+    """Whether body ``observer`` knows each quantity in ``PIECES`` of each body, [n, N + 1, PIECES] (body 0: the
+    obstacle).
 
-    *Pieces* are the quantities that a message can contain, such as speed and intent (the newest command). Body 0 is the
-    obstacle. The observer knows what a vehicle's messages contain, but its intent only after its first message. It also
-    knows place, speed and acceleration of a neighbour in sight, and everything of itself and of the obstacle.
+    *Pieces* are the quantities that a message can contain. Of another vehicle the observer knows nothing before
+    ``state.know`` and, with periodic messages, before it has a sample. Then it knows the pieces that this vehicle's
+    messages contain (the intent, its newest command, only after its first message) and, if the vehicle is in sight,
+    place, speed and acceleration. It knows all pieces of itself and of the obstacle.
     """
     memory: MessageMemory = state.memories[MESSAGES_KEY]
     time = state.time_s[:, np.newaxis]
@@ -115,8 +117,8 @@ def _known_if(state: State, observer: int, holds: Bools) -> Floats:
 def ages_s(state: State) -> Floats:
     """Age of the newest sample that body i has of body j, [n, N + 1, N + 1] s; infinite if i has none.
 
-    Body 0 is the obstacle. Without periodic messages all ages are 0, because from the time ``state.know`` on body i
-    knows the present state of body j.
+    Body 0 is the obstacle. Without periodic messages all ages are 0: once body i knows of body j (time ``state.know``),
+    it always knows the present state of j.
     """
     memory: MessageMemory = state.memories[MESSAGES_KEY]
     if not memory.is_periodic:

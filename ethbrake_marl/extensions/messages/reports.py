@@ -106,7 +106,7 @@ class Reports(Extension):
         return _errors(v2x).noise_mps > 0.0
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse an unknown liar."""
+        """Raise ``InvalidInput`` if the key ``liar`` names no vehicle of the scenario."""
         errors = _errors(scenario.v2x)
         if "liar" in errors.model_fields_set:
             check_vehicle(errors.liar, scenario.vehicles, ("v2x", NAME, "liar"), errors.liar)

@@ -146,8 +146,8 @@ def largest_behind(gap, v_l, a_l, v_f, a_f, u, limit):
 def lowest_while_coasting(at):
     """Smallest gap (m) of the rear pair while the controlled vehicle coasts, until it may act.
 
-    ``at``: one world at the alert (columns: file ``line``). The gap is a convex function of time: it is smallest when
-    both vehicles are equally fast, or at the start or end.
+    ``at``: one world at the alert (columns: ``proofs/line.py``). The gap is a convex function of time: it is smallest
+    when both vehicles are equally fast, or at the start or end.
     """
     w = at[V_R] - at[V_F]
     if w <= 0.0:
@@ -181,9 +181,9 @@ def plan_behind(at, ahead, v_l, out):
 def decide(at, out):
     """Decide whether contact is avoidable in one world; write the verdict to ``out`` [VERDICT].
 
-    ``at``: the world (columns: file ``line``). Columns of ``out``: REASON; MARGIN (m); SPARE, gap ahead that is left
-    after full braking (m); DRIVE and TOUCH, end of the drive and of the full braking after it (s after the vehicle may
-    act); FOLLOW, command after TOUCH (m/s2).
+    ``at``: the world (columns: ``proofs/line.py``). Columns of ``out``: REASON; MARGIN (m); SPARE, gap ahead that is
+    left after full braking (m); DRIVE and TOUCH, end of the drive and of the full braking after it (s after the vehicle
+    may act); FOLLOW, command after TOUCH (m/s2).
     """
     start, v_f, v_l, ahead = at[ONSET_F], at[V_F], 0.0, FAR_M
     out[REASON], out[MARGIN], out[SPARE] = AVOIDABLE, math.inf, math.inf

@@ -45,7 +45,7 @@ def decision_around(at, early, late):
     """Start and end (s) of the decision step that contains both times, ``early`` and ``late`` (s).
 
     Both results are ``late`` if no step contains both, or if commands may change at any time. ``at``: one world
-    (columns: file ``line``).
+    (columns: ``proofs/line.py``).
     """
     step = at[TIME_STEP]
     if step <= 0.0:

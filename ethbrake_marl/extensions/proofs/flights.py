@@ -26,7 +26,8 @@ def flight_lead(pair, opening, flight):
     the opening speed o, the lead is ``share (press L - o) - G``. G is the speed (m/s) that the vehicle must give up to
     stay apart from its partner for the time L. It is the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o
     L``, because the vehicle can give up at most ``reach`` in each second. The result is -inf if no command keeps the
-    two apart for so long. ``pair``: top of this file.
+    two apart for so long. ``share``, ``press`` and ``reach`` are elements of ``pair``, explained at the top of this
+    file.
     """
     share, press, reach, _ = pair
     relative = share * (press * flight - opening)

@@ -84,7 +84,7 @@ def rear_after(at, early):
     """Rear vehicle at ``early`` (s): its distance to the leader (m), its speed (m/s) and its onset (s).
 
     The *onset* is the time from ``early`` until the rear vehicle begins to brake. The distance leaves out the length of
-    the controlled vehicle. ``at``: one world (columns: file ``line``).
+    the controlled vehicle. ``at``: one world (columns: ``proofs/line.py``).
     """
     speed, way = follower(at, early)
     return max(at[GAP_L] + at[GAP_R] + leader(at, early)[1] - way, 0.0), speed, max(at[ONSET_R] - early, 0.0)

@@ -97,7 +97,7 @@ class LowerBound(NamedTuple):
 def front_bound(at):
     """Smallest squared closing speed (m2/s2) and latest time (s) of the front pair's first contact.
 
-    The time is infinite if full braking avoids the contact. ``at``: one world (columns: file ``line``).
+    The time is infinite if full braking avoids the contact. ``at``: one world (columns: ``proofs/line.py``).
     """
     _, time, squared = behind_leader(at, braking(0.0, at[A_F]), at[V_F] / at[A_F])
     if at[A_F] < at[A_L] and at[V_F] < at[V_L]:
@@ -185,12 +185,12 @@ def outer_contact(at):
 
 @large
 def front_first(at, floor, best, enough, cells):
-    """Lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front, or of all three vehicles.
+    """Lower bound (m2/s2), at most ``best``, on the harm if the controlled vehicle first meets the front vehicle, or
+    meets both neighbours at once.
 
-    In a contact of all three vehicles, the closing speeds of the two pairs add up to the closing speed of the rear
-    vehicle relative to the front vehicle, and the closing speed of the front pair is at least the smallest possible one
-    at this time. Such a contact is covered only at times at which a first contact with the front vehicle is possible.
-    Arguments: package ``proofs``.
+    If it meets both at once, the two closing speeds add up to that of the rear vehicle towards the front vehicle, and
+    the front one cannot be below the smallest possible at that time. This case counts only at times at which a first
+    contact with the front vehicle is possible. Arguments: package ``proofs``.
     """
     first = meet_front(at, math.inf)
     if first == math.inf and at[GAP_L] <= TOUCHING_M:
@@ -250,7 +250,7 @@ def rear_first(at, floor, best, enough, cells):
 def last_rest(at):
     """Time (s) after which no harm that ``combined_bound`` counts can happen.
 
-    ``at``: one world (columns: file ``line``).
+    ``at``: one world (columns: ``proofs/line.py``).
     """
     stand = rest_of_rear(at)
     way = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, stand)[1]
@@ -283,7 +283,7 @@ def combined_bound(at, until, front, rear, cells):
 def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
     """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2): front pair, rear pair, both together.
 
-    ``rows`` [n, LINE_COLUMNS]: the worlds (columns: file ``line``). Harm after ``until`` [n] (s) does not count.
+    ``rows`` [n, LINE_COLUMNS]: the worlds (columns: ``proofs/line.py``). Harm after ``until`` [n] (s) does not count.
     ``has_front`` [n]: whether the front vehicle exists and the next impact with it counts; ``has_rear`` [n]: the same
     for the rear vehicle. ``unavoidable`` [n]: whether contact cannot be avoided. ``cells``: memory, overwritten.
     """

@@ -38,7 +38,7 @@ def gentlest_front(at, time):
     """Smallest closing speed (m/s) of a contact with the front vehicle at ``time`` (s), and the drive before it (s).
 
     To be at a place at a time with the smallest speed, a vehicle drives first and then brakes; the second result is how
-    long it drives. ``at``: one world (columns: file ``line``).
+    long it drives. ``at``: one world (columns: ``proofs/line.py``).
     """
     v_l, way = leader(at, time)
     place, v, u, a = at[GAP_L] + way, at[V_F], at[U_F], at[A_F]
@@ -61,7 +61,7 @@ def gentlest_front(at, time):
 def braked_then_driven(at, brake, time):
     """Way (m) and speed (m/s) at ``time`` (s) of a vehicle that brakes first, at most to rest, and then drives.
 
-    ``brake``: duration of the braking (s). ``at``: one world (columns: file ``line``).
+    ``brake``: duration of the braking (s). ``at``: one world (columns: ``proofs/line.py``).
     """
     v, u, a = at[V_F], at[U_F], at[A_F]
     braked = min(brake, v / a)
@@ -82,7 +82,7 @@ def braked_then_driven(at, brake, time):
 def braking_to_rear(at, time):
     """Time (s) for which the controlled vehicle must brake, before it drives, to meet the rear vehicle at ``time`` (s).
 
-    ``at``: one world (columns: file ``line``).
+    ``at``: one world (columns: ``proofs/line.py``).
     """
     place = follower(at, time)[1] - at[GAP_R]
     low, high = 0.0, time
@@ -114,7 +114,7 @@ def gentlest(kind, at, time):
 def behind_leader(at, plan, until):
     """Smallest gap (m) to the front vehicle under a plan, time (s) and squared closing speed (m2/s2) of the contact.
 
-    ``at``: one world (columns: file ``line``). ``plan``: of the controlled vehicle, until ``until`` (s); see
+    ``at``: one world (columns: ``proofs/line.py``). ``plan``: of the controlled vehicle, until ``until`` (s); see
     ``plans.walk``.
     """
     return walk(at[GAP_L], at[V_L], braking(0.0, at[A_L]), at[V_F], plan, until)
@@ -143,7 +143,7 @@ def braking_first(at, brake):
 def rest_of_rear(at):
     """Time (s) at which the rear vehicle comes to rest if nothing pushes it.
 
-    ``at``: one world (columns: file ``line``).
+    ``at``: one world (columns: ``proofs/line.py``).
     """
     return at[ONSET_R] + at[V_R] / at[A_R]
 
@@ -152,7 +152,7 @@ def rest_of_rear(at):
 def meet_front(at, drive):
     """Time (s) at which a vehicle that drives for ``drive`` s, then brakes, meets the front vehicle; infinite: never.
 
-    ``at``: one world (columns: file ``line``).
+    ``at``: one world (columns: ``proofs/line.py``).
     """
     return behind_leader(at, driving_first(at, drive), math.inf)[1]
 
@@ -161,7 +161,7 @@ def meet_front(at, drive):
 def meet_rear(at, brake):
     """Time (s) at which the rear vehicle meets a vehicle that brakes for ``brake`` s, then drives; infinite: never.
 
-    ``at``: one world (columns: file ``line``).
+    ``at``: one world (columns: ``proofs/line.py``).
     """
     return before_rear(at, braking_first(at, brake), rest_of_rear(at))[1]
 
@@ -170,7 +170,7 @@ def meet_rear(at, brake):
 def stays_ahead(at, drive, until):
     """Whether a vehicle that drives for ``drive`` s, then brakes, avoids the rear vehicle until ``until`` (s).
 
-    ``at``: one world (columns: file ``line``).
+    ``at``: one world (columns: ``proofs/line.py``).
     """
     return before_rear(at, driving_first(at, drive), until)[0] >= -AHEAD_M
 
@@ -179,6 +179,6 @@ def stays_ahead(at, drive, until):
 def stays_behind(at, brake, until):
     """Whether a vehicle that brakes for ``brake`` s, then drives, avoids the front vehicle until ``until`` (s).
 
-    ``at``: one world (columns: file ``line``).
+    ``at``: one world (columns: ``proofs/line.py``).
     """
     return behind_leader(at, braking_first(at, brake), until)[0] >= -AHEAD_M

@@ -129,9 +129,9 @@ def open_reading(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]
 def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: int) -> RandomOutcome:
     """Outcome if all vehicles brake fully or, with ``plans``, Vehicle 2 holds the deceleration that E-V2X-BM plans.
 
-    ``worlds``: reading that defines the simulated worlds. ``plans``: reading that defines the worlds for which E-V2X-BM
-    plans. ``after_impact``: what follows an impact. Its vehicles brake on (``brakes on``) or coast from the next
-    decision on (``coasts``), or the episode ends (``ends``).
+    ``worlds``, ``plans``: readings (interpretations of the paper's text) that define the simulated worlds, and the
+    worlds for which E-V2X-BM plans. ``after_impact``: the vehicles of an impact brake on (``brakes on``) or coast from
+    the next decision on (``coasts``), or the episode ends (``ends``).
     """
     if after_impact != "brakes on" and worlds.step_s is None:
         worlds = worlds._replace(others=(*worlds.others, ("time_step_s", SHORT_STEP_S)))
@@ -177,7 +177,8 @@ def plan(plans: Reading, episodes: int) -> ConstantDeceleration:
 
 @cache
 def drive_all(worlds: Reading, spec: str, counted: str, episodes: int) -> RandomOutcome:
-    """Outcome of the agent ``spec`` as Vehicle 2. ``worlds``: reading that defines the worlds.
+    """Outcome if the agent ``spec`` drives Vehicle 2 in the worlds of one interpretation of the paper's text
+    (``worlds``).
 
     ``counted``: harm that the agent minimises, ``first`` or ``total``. The warning that a policy was trained for other
     worlds is suppressed.

@@ -37,13 +37,14 @@ def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> 
     """Outcome of each strategy under one interpretation (``reading``) of the paper's text: name -> outcome.
 
     ``policies``: name -> agent name. Every policy also has a hybrid (``algorithm_1``), which compares first-impact
-    harm. If impacts are exact, E-V2X-BM (coupled) and its hybrids are included.
+    harm. If impacts are exact, E-V2X-BM (coupled) and its hybrids are included. Outcomes of E-V2X-BM and of hybrids
+    also have the predicted harm (``PREDICTED``).
     """
     worlds, plans = reading.only(*WORLD_FIELDS), reading.only(*PLANS)
     baseline = {**brake(worlds, plans, "brakes on", episodes), PREDICTED: plan(plans, episodes).harm}
     outcomes: dict[str, RandomOutcome] = {NON_E: brake(worlds, None, "brakes on", episodes), E_V2X_BM: baseline}
-    hybrids: dict[str, RandomOutcome] = {"": baseline}
-    if reading.step_s is None:
+    hybrids: dict[str, RandomOutcome] = {"": baseline}  # ending of the hybrid's name -> outcome of its E-V2X-BM
+    if reading.step_s is None:  # exact impacts
         coupled = drive_all(worlds, "e_v2x_bm", "first", episodes)
         outcomes[COUPLED] = {**coupled, PREDICTED: coupled["first"]}
         hybrids[f", {SIMULATED}"] = outcomes[COUPLED]

@@ -26,10 +26,12 @@ WAYS = ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5))  # (`early`, `share`) in `write_
 
 
 def extreme_profiles(problem: Problem) -> Profiles:
-    """Best profiles of full driving and full braking for one controlled vehicle, [n * KEPT_PROFILES], world by world.
+    """The ``KEPT_PROFILES`` best profiles that only drive or brake fully, for one controlled vehicle, [n *
+    KEPT_PROFILES], world by world.
 
-    The contacts with its neighbours are predicted as if the neighbours braked fully. In worlds without neighbours, or
-    with a vehicle that moves backward, the profiles coast.
+    The time of the first change of command is searched on a grid that is refined around the best. The second change is
+    when the vehicle meets its neighbour, predicted as if neighbours braked fully. In worlds without neighbours, or with
+    a vehicle that moves backward, the profiles coast.
     """
     (body,), n, last = problem.bodies.tolist(), problem.n, problem.last_step
     at, random = rows_of(problem.state, body), random_states(problem.identity, 0)

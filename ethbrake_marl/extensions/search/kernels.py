@@ -309,12 +309,14 @@ def gather(world, room, ends, commands, phases, random_count, drawing, tolerance
 
 @large
 def improve(world, room, ends, commands, budget, drawing, least):
-    """Improve a profile in place by at most ``budget`` random changes, until its value is at most ``least``.
+    """Improve a profile in place by random changes, at most ``budget``, until its value is at most ``least`` (m2/s2).
 
     ``world``, ``room``: a ``World``, ``Room``. ``ends`` [K], ``commands`` [K, B]: the profile. ``drawing``: as for
-    ``draw_profile``. Returns the profile's value (m2/s2), infinite if the profile cannot be simulated, and the number
-    of phases until the episode ends. A change that helps is tried again with twice the amount. A change without effect
-    costs no budget, except in plans.
+    ``draw_profile``. A change that helps is repeated with twice the amount. A change that leaves the profile as it was
+    costs no budget, unless ``drawing`` is of the kind ``PLAN``.
+
+    Returns the profile's value (m2/s2; infinite if it cannot be simulated), and its number of phases until the episode
+    ends.
     """
     change, lines, trial_lines = room.change, room.lines, room.tried
     new_ends, new_commands = room.ends[: ends.shape[0]], room.commands[: ends.shape[0]]

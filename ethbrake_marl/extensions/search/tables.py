@@ -77,7 +77,7 @@ class BestHarmTable:
         return buffer.getvalue()
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
-        """Index in this table of each world with the hashes ``identity``; -1 for a world that is not in the table."""
+        """Row of this table for each world in ``identity`` [n]; -1 for a world that is not in the table."""
         order = np.argsort(self.identity, kind="stable")
         rows = order[np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)]
         return np.where(self.identity[rows] == identity, rows, -1)
