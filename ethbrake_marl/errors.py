@@ -212,7 +212,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
     advice = f"; your own {kind} must be registered or installed first (docs/extend.md)" if may_be_own else ""
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{advice}"
-    return UnknownName(f"unknown {kind} {name!r}; {new_name(name) or hint}")
+    return UnknownName(f"unknown {kind} {name!r}; {new_name(kind, name) or hint}")
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:

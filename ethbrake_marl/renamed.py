@@ -8,21 +8,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-RENAMED: Mapping[str, str] = MappingProxyType(  # Python names, scenarios, policies, recipes, shields, commands
+RENAMED: Mapping[str, Mapping[str, str]] = MappingProxyType(  # kind of the name -> old name -> new name
     {
-        "EthBrake-v1": "EthBrake-v2",
-        "drive": "play_to_end",
-        "compare": "evaluate",
-        "compare_results": "evaluate",
-        "fronts": "cooperation",
-        "universal-paper": "vine-paper",
-        "cooperation-0-sensors": "level-0-sensors",
-        "standards-ccrb": "standards-ccrb-2026",
-        "standards-ccrm": "standards-ccrm-2026",
+        "attribute": {"drive": "play_to_end", "compare_results": "evaluate", "fronts": "cooperation"},
+        "command": {"compare": "evaluate"},
+        "scenario": {
+            "cooperation-0-sensors": "level-0-sensors",
+            "standards-ccrb": "standards-ccrb-2026",
+            "standards-ccrm": "standards-ccrm-2026",
+        },
+        "agent": {"universal-paper": "vine-paper"},
+        "recipe": {"universal-paper": "vine-paper"},
+        "shipped policy": {"universal-paper": "vine-paper"},
     }
 )
 
 
-def new_name(name: object) -> str:
-    """Advice such as "renamed to level-0-sensors" for a name of version 1.0; "" for any other."""
-    return f"renamed to {RENAMED[name]}" if isinstance(name, str) and name in RENAMED else ""
+def new_name(kind: str, name: object) -> str:
+    """Advice such as "renamed to level-0-sensors" for a name of version 1.0; "" for any other.
+
+    ``kind``: what has the name, such as ``scenario`` (``RENAMED``).
+    """
+    names = RENAMED.get(kind, {})
+    return f"renamed to {names[name]}" if isinstance(name, str) and name in names else ""

@@ -90,8 +90,8 @@ def run_command(arguments: Sequence[str]) -> int:
         where = context.command_path if context else "ethbrake"
         message = re.sub(r"Value error, |, unable to parse string as an? \w+", "", error.format_message())
         message = message.replace("Input should be", "must be").replace("a valid integer", "a whole number")
-        unknown = re.match(r"No such (?:command|option:?) '?([\w-]+)'?", message)
-        if unknown and (renamed := new_name(unknown[1])):
+        unknown = re.match(r"No such command '([\w-]+)'", message)
+        if unknown and (renamed := new_name("command", unknown[1])):
             message = f"{unknown[0]}; {renamed}"
         return _refuse(f"{message} (see: {where} --help)")
     except EthBrakeError as error:

@@ -153,7 +153,8 @@ def parse_objective(text: str) -> Objective:
         if colon:
             raise InvalidInput(f"objective {text!r}: {name} takes no argument")
         return Objective(kind)
-    if kind.arguments is float and parse_numeral(argument) is None:
+    number = parse_numeral(argument) if kind.arguments is float else 0.0
+    if number is None or not math.isfinite(number):
         raise InvalidInput(f"objective {text!r}: {name} needs a number, as in {name}:5")
     if kind.arguments:
         if isinstance(kind.arguments, tuple) and argument not in kind.arguments:
@@ -304,9 +305,13 @@ def register_objective(
             raise InvalidInput(f"{what}: its value is not finite in row {int(np.argmin(np.isfinite(value)))}")
         return value.astype(np.float64)
 
-    listed = arguments if isinstance(arguments, type) else tuple(arguments)
-    form = f"{name}:{'|'.join(listed) if isinstance(listed, tuple) else 'NUMBER'}" if listed else name
-    kind = Kind(form, meaning, amount, function=function, arguments=listed)
+    listed = () if isinstance(arguments, type) else arguments
+    is_list = isinstance(listed, Sequence) and all(isinstance(argument, str) for argument in listed)
+    if not is_list or (isinstance(arguments, type) and arguments is not float):
+        raise InvalidInput(f"objective {name!r}: arguments = {arguments!r:.60}: must be a list of texts, or float")
+    form = f"{name}:{'|'.join(listed) or 'NUMBER'}" if arguments else name
+    allowed = float if isinstance(arguments, type) else tuple(listed)
+    kind = Kind(form, meaning, amount, function=function, arguments=allowed)
     OBJECTIVES.add(name, kind, lambda registered: registered.function is function)
 
 

@@ -75,7 +75,10 @@ def ask_script(script: Any, state: State, memory: Any, body: int) -> tuple[Float
     Raises ``AgentFailed`` if the script fails, or if its commands are not numbers or exceed a capacity.
     """
     answer, memory = _call(script, "act", state, memory, body)
-    commands = np.asarray(answer)
+    try:
+        commands = np.asarray(answer)
+    except ValueError:  # lists of different lengths
+        commands = np.empty(())
     if commands.shape != (state.n,) or commands.dtype.kind not in "fiu":
         right = f"must be numbers of the shape ({state.n},)"
         raise AgentFailed(name_of(script), None, f"vehicle_{body}: its commands are {answer!r:.60}; {right}")

@@ -14,7 +14,6 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.plain import parse_strict_json
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, parse_numeral, read_yaml
-from ethbrake_marl.renamed import new_name
 
 # Suffix of a key -> unit in words.
 UNITS = {
@@ -233,12 +232,10 @@ def _right(detail: ErrorDetails) -> str:
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:
-    """Text "did you mean ...?" or "renamed to ..." for an unknown ``key``; empty if no known key is similar.
+    """Text "did you mean ...?" for an unknown ``key``; empty if no known key is similar.
 
     A key with a wrong or missing unit, such as ``gaps_km`` or ``mass``, is also recognised.
     """
-    if renamed := new_name(key):
-        return renamed
     names = sorted(known)
     stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}
     same = stems.get(key.rsplit("_", 1)[0]) or stems.get(key)

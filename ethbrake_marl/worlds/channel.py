@@ -125,9 +125,22 @@ class Extension:
 
 
 def register_v2x_extension(key: str, extension: Extension) -> None:
-    """Register the extension for a key of ``v2x``. Entry points: ``ethbrake_marl.v2x_extensions``."""
-    if extension.name in ("physics", "shaping", "shield"):  # memories that a game has itself
-        raise InvalidInput(f"key {key!r} of v2x: the name of its memory, {extension.name!r}, is in use; choose another")
+    """Register the extension for a key of ``v2x``. Entry points: ``ethbrake_marl.v2x_extensions``.
+
+    Raises ``InvalidInput`` for an object that is not an ``Extension``, for a key that is not in its ``keys``, and for a
+    ``name`` in use; ``AlreadyExists`` for a key of ``v2x`` itself.
+    """
+    keys, name = getattr(extension, "keys", None), getattr(extension, "name", None)
+    if name in ("physics", "shaping", "shield"):  # memories that a game has itself
+        raise InvalidInput(f"key {key!r} of v2x: the name of its memory, {name!r}, is in use; choose another")
+    is_named = isinstance(extension, Extension) and isinstance(name, str)
+    if not is_named or key not in getattr(keys, "model_fields", ()):
+        raise InvalidInput(
+            f"key {key!r} of v2x: {extension!r:.60}: must be an Extension with a name, whose keys are a ScenarioPart"
+            f" with a field {key}"
+        )
+    if key in V2X.model_fields:
+        raise AlreadyExists(f"key {key!r} of v2x: this name is already in use; give another name")
     EXTENSIONS.add(key, extension, lambda registered: registered is extension)
 
 

@@ -11,6 +11,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.episode.features import FEATURES
 from ethbrake_marl.errors import AgentFailed, AlreadyExists, InvalidInput, UnknownName
+from ethbrake_marl.worlds.channel import Extension, register_v2x_extension
+from ethbrake_marl.worlds.quantity import ScenarioPart
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")
@@ -230,3 +232,42 @@ def test_policy__observes_the_features_that_it_was_trained_on(again: Any, messag
         eb.register_feature("urgency", other, **SCALED | {"scale": scale})
     with refused(f"manifest.json: the policy {message}"):
         eb.load_policy(kept)
+
+
+def test_objective__arguments_are_texts_or_numbers() -> None:
+    def mine(harm: Any, vehicle: int, argument: Any) -> Any:
+        """Harm of the line."""
+        return harm.whole
+
+    for arguments in ([1, 2], 5, None, int, str):
+        with pytest.raises(InvalidInput, match="must be a list of texts, or float"):
+            eb.register_objective("with-argument", mine, arguments=arguments)  # type: ignore[arg-type]
+
+
+def test_v2x_extension__has_a_name_and_keys() -> None:
+    class Keys(ScenarioPart):
+        gap_noise_m: float = 0.0
+        lost: float = 0.0
+
+    class GapNoise(Extension):
+        name, keys = "gap_noise", Keys
+
+    for key, extension in (("gap_noise", GapNoise()), ("gap_noise_m", GapNoise), ("gap_noise_m", "text")):
+        with pytest.raises(InvalidInput, match=f"key '{key}' of v2x: .* must be an Extension with a name"):
+            register_v2x_extension(key, extension)  # type: ignore[arg-type]
+    with pytest.raises(AlreadyExists, match="already in use"):
+        register_v2x_extension("lost", GapNoise())
+
+
+def test_commands__of_different_lengths_are_refused() -> None:
+    class Ragged:
+        name, knows = "ragged", "own sensors"
+
+        def begin(self, alert: Any, body: int) -> None:
+            return None
+
+        def act(self, state: Any, memory: None, body: int) -> Any:
+            return [[1.0], [1.0, 2.0]], None
+
+    with pytest.raises(AgentFailed, match=r"its commands are \[\[1.0\], \[1.0, 2.0\]\]; must be numbers"):
+        eb.evaluate("paper-random", {"ragged": eb.Team.of({"vehicle_2": Ragged()}, "ragged")}, episodes=2)

@@ -1,9 +1,9 @@
 """Noisy and false reports: the key ``reports`` of a scenario's ``v2x``.
 
 Every vehicle sees the other vehicles' speeds with an error ``bias_mps + noise_mps z``, where z is a standard normal
-number for each world, vehicle and decision. The ``liar`` also seems neither to brake nor to drive. Messages contain
-these errors, so an old message keeps the error it was sent with. Gaps, and what a vehicle measures of itself, are
-exact.
+number for each world, vehicle and decision (one z for all messages before the first decision). The ``liar`` also seems
+neither to brake nor to drive. Messages contain these errors, so an old message keeps the error it was sent with. Gaps,
+and what a vehicle measures of itself, are exact.
 """
 
 from __future__ import annotations
