@@ -10,7 +10,7 @@ import numpy as np
 
 from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.commands import proposal_array
-from ethbrake_marl.episode.layer import Layer, agent_through, observe_through, script_through
+from ethbrake_marl.episode.layer import Layer, agent_through, observe_through, script_through, see_through
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.script_calls import ask_scripts, begin_script
@@ -212,7 +212,7 @@ class Game(NamedTuple):
         for layer in self.layers:
             if layer is before:
                 break
-            state = layer.seen(state, body)
+            state = see_through(layer, state, body)
         return state
 
     def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:

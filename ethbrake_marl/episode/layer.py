@@ -10,6 +10,7 @@ import numpy as np
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.script_calls import UserScript, name_of
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
 from ethbrake_marl.motion.layout import Bools, Floats
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ class Layer:
         self, later: tuple[Layer, ...], view: View, state: State, body: int, time_step_s: float
     ) -> Observations:
         """Observations of vehicle ``body`` through this layer and the ``later`` ones, [n, F]."""
-        return observe_through(later, view, self.seen(state, body), body, time_step_s)
+        return observe_through(later, view, see_through(self, state, body), body, time_step_s)
 
     def script(self, script: Any) -> Any:
         """A script that acts like ``script`` on the state that this layer lets through to its vehicle."""
@@ -87,10 +88,10 @@ class LayeredScript:
         self.needs_ahead = getattr(script, "needs_ahead", ())
 
     def begin(self, alert: State, body: int) -> Any:
-        return self.inner.begin(self.layer.seen(alert, body), body)
+        return self.inner.begin(see_through(self.layer, alert, body), body)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        answer: tuple[Floats, Any] = self.inner.act(self.layer.seen(state, body), memory, body)
+        answer: tuple[Floats, Any] = self.inner.act(see_through(self.layer, state, body), memory, body)
         return answer
 
 
@@ -99,6 +100,20 @@ class Observer:
     """Base class of agents that act on the observations of a view. The agent observes the state through ``layers``."""
 
     layers: tuple[Layer, ...] = ()
+
+
+def see_through(layer: Layer, state: State, body: int) -> State:
+    """State as vehicle ``body`` sees it through one layer. Raises ``InvalidInput`` if the layer fails."""
+    what = f"layer {type(layer).__name__}"
+    try:
+        view = layer.seen(state, body)
+    except EthBrakeError:
+        raise
+    except Exception as error:
+        raise InvalidInput(f"{what}: seen fails: {describe_error(error)}") from error
+    if not isinstance(view, State) or view.line.shape != state.line.shape:
+        raise InvalidInput(f"{what}: seen must return a State of the same {state.n} worlds and vehicles")
+    return view
 
 
 def observe_through(layers: tuple[Layer, ...], view: View, state: State, body: int, time_step_s: float) -> Observations:

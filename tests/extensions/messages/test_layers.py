@@ -16,6 +16,8 @@ from tests.contract.interfaces import PAPER
 from tests.fixtures.layer import SamePhysics, UsersExtension
 from tests.refused import refused
 
+PPO = eb.Team.of({"vehicle_2": eb.make_agent("ppo", scenario="paper-random")}, "ppo")
+
 
 class Mine(Layer):
     """Reports the time."""
@@ -139,3 +141,21 @@ def test_layers__compose_in_the_order_of_their_stages_each_with_its_memory(
         if isinstance(layer, Faster):
             assert state.memories[layer.name].tolist() == [3.0, 3.0]
             assert game.extra_infos(state)[layer.name].tolist() == [3.0, 3.0]
+
+
+@pytest.mark.parametrize("answer", [lambda state: 1 / 0, lambda state: None, lambda state: state.take([0])])
+def test_layer__that_fails_is_named(answer: Callable[[eb.State], Any]) -> None:
+    class Broken(Layer):
+        def seen(self, state: eb.State, body: int) -> Any:
+            return answer(state)
+
+    scenario, game = open_game("paper-random")
+    state, broken = game.reset(scenario.sample(3, seed=7)), game.with_layers([Broken()])
+    calls = {
+        "seen": lambda: broken.seen(state, 2),
+        "observe": lambda: broken.observe_alike(state, [2]),
+        "drive": lambda: eb.play_to_end(broken, scenario.sample(3, seed=7), PPO),
+    }
+    for call in calls.values():
+        with pytest.raises(eb.EthBrakeError, match=r"^layer Broken: seen "):
+            call()
