@@ -42,7 +42,7 @@ def unchanged(tmp_path_factory: pytest.TempPathFactory) -> str:
     [
         ("impact.py", "PLASTIC_MPS = 0.05", "PLASTIC_MPS = 0.5", True),
         ("impact.py", "bounce * (pooled - line[SPEED, i])", "bounce * (pooled - line[SPEED, i]) * (1.0 + 1e-15)", True),
-        ("push.py", "taken *= duration", "taken *= 2.0 * duration", True),
+        ("push.py", "push *= duration", "push *= 2.0 * duration", True),
         ("contact.py", "def contact(", "def contact(", False),
         ("impact.py", "pooled", "together", False),  # another name
     ],
