@@ -16,6 +16,7 @@ from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.script_calls import ask_scripts, begin_script
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import Step, StepSettings
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Floats, Ints
 
 
@@ -134,7 +135,13 @@ class Game(NamedTuple):
     physics: Physics | None = None  # None: exact impacts
 
     def with_layers(self, layers: Sequence[Layer]) -> Game:
-        """Copy of a game without layers, with ``layers`` between the true state and the game's views and scripts."""
+        """Copy of this game, with ``layers`` between the true state and the game's views and scripts.
+
+        Raises ``InvalidInput`` if the game has layers already, for instance those of its scenario's messages.
+        """
+        if self.layers:
+            names = ", ".join(type(layer).__name__ for layer in self.layers)
+            raise InvalidInput(f"game {self.name!r} has layers already ({names}); add another by a key of v2x")
         layers = tuple(layers)
         scripts = {body: script_through(layers, script) for body, script in self.scripts.items()}
         return self._replace(scripts=scripts, layers=layers)

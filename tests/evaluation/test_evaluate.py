@@ -453,11 +453,15 @@ def refusals() -> dict[str, Any]:
         "agents = {}: must be a mapping from names to teams": lambda: evaluate_teams(drawn, {}, game),
         "must be a mapping from names to teams, for instance": lambda: evaluate_teams(drawn, {"a": FULL_BRAKE}, game),  # type: ignore[dict-item]
         "agents = 'full_brake'": lambda: evaluate_teams(drawn, "full_brake", game),  # type: ignore[arg-type]
-        "3 worlds of 3 vehicles; must be one or more worlds of 3 vehicles": lambda: evaluate_teams(begun, mine, game),
+        "3 worlds of 3 vehicles; must be one or more worlds of 3 vehicles at": lambda: (
+            evaluate_teams(begun, mine, game)
+        ),
         "worlds: 0 worlds": lambda: evaluate_teams(drawn.worlds.take(slice(0)), mine, game),
         "2 worlds of 5 vehicles; must be": lambda: evaluate_teams(pair, mine, game),
         "team 'x': drives vehicle_1; must drive exactly vehicle_2": lambda: evaluate_teams(drawn, {"a": wrong}, game),
-        "agent 'wild', world 0, vehicle_2 at 0.50 s: command nan": lambda: evaluate_teams(drawn, teams(Wild()), game),
+        "agent 'wild', world 0, vehicle_2 at 0.50 s: command nan m/s2": lambda: (
+            evaluate_teams(drawn, teams(Wild()), game)
+        ),
         "this cannot be sent to another process (cannot": lambda: evaluate_teams(drawn, teams(local), game, jobs=2),
     }  # fmt: skip
 

@@ -159,3 +159,9 @@ def test_layer__that_fails_is_named(answer: Callable[[eb.State], Any]) -> None:
     for call in calls.values():
         with pytest.raises(eb.EthBrakeError, match=r"^layer Broken: seen "):
             call()
+
+
+def test_layers__are_not_replaced_without_a_word() -> None:
+    _, game = open_game("messages-noisy")
+    with pytest.raises(eb.EthBrakeError, match=r"has layers already \(ReportsLayer, MessagesLayer\)"):
+        game.with_layers([Mine()])
