@@ -24,7 +24,10 @@ OPTIONS = {
     "--each": {"action": "store_true", "help": "delete one extension at a time, with the extensions that use it"},
     "--whole": {"action": "store_true", "help": "run all cases of all tests of the core (minutes)"},
 }
-COPIED = (".ci", "docs", "ethbrake_marl", "scenarios", "tests", "train", "Makefile", "README.md", "pyproject.toml")
+COPIED = (
+    *(".ci", "docs", "ethbrake_marl", "scenarios", "tests", "train"),
+    *("CHANGELOG.md", "Makefile", "README.md", "pyproject.toml"),
+)
 APART = ("docs", "programmes")  # tests of the whole repository, not only of the core
 INSTALLATION = ("test_imports.py",)  # start many processes
 OF_ALL = ("extensions/test_printed.py",)  # what all extensions print together

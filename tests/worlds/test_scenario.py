@@ -308,7 +308,8 @@ def test_sentences__say_what_each_key_means() -> None:
 def test_json_schema__accepts_what_the_reader_accepts() -> None:
     editor = jsonschema.Draft202012Validator(explain.scenario_json_schema())
     for entry in list_scenarios():
-        assert not [*editor.iter_errors(read_yaml(entry.path).content)], entry.name
+        if entry.name in SHIPPED:
+            assert not [*editor.iter_errors(read_yaml(entry.path).content)], entry.name
     for key, rule in QUANTITIES.items():
         inside, outside = rule.high, np.nextafter(rule.high, np.inf)
         for content in ({key: inside}, {key: {"uniform": [inside, inside]}}):
