@@ -12,9 +12,10 @@ from ethbrake_marl.episode.commands import LARGEST_ACTION, action_array, check_a
 from ethbrake_marl.episode.counts import COUNTS, OF_FIRST, OF_TOTAL, beside_harm
 from ethbrake_marl.episode.script_calls import ask_scripts
 from ethbrake_marl.episode.state import CLOCK_COLUMNS, END, ENDED, FIRST_DECISION, LAST, NUMBER, STEPS, TIME, State
+from ethbrake_marl.episode.threads import call_slices
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.interval import EVENT_BY_EVENT, FAILED, move_line, move_lines
+from ethbrake_marl.motion.interval import EVENT_BY_EVENT, FAILED, is_line_of_three, move_line, move_lines
 from ethbrake_marl.motion.layout import (
     FORCE,
     IMPACTS,
@@ -51,6 +52,7 @@ class StepSettings(NamedTuple):
     terminal: float = 0.0  # weight of an end without impact in the reward
     weights: Floats = COUNTS["first"]  # [6] of the count of harm in the reward (``episode.counts``)
     most_steps: float = np.inf  # number of steps after which an episode is truncated, as at the horizon
+    threads: int = 1  # that advance slices of many worlds at once (``episode.threads``)
 
 
 class Step(NamedTuple):
@@ -112,16 +114,23 @@ def step(
     Raises ``InvalidInput`` for a bad action, and ``PhysicsError`` if a check of the physics fails. ``state`` is
     unchanged, unless ``donate`` allows its arrays to be overwritten.
     """
-    actions = action_array(settings.learners, actions, state.n)
+    n = state.n
+    actions = action_array(settings.learners, actions, n)
     line, car, clock, know, wanted, memories = ask_scripts(scripts, state) if scripts else state
+    reward, out = np.empty((n, wanted.shape[1] - 1)), np.empty((OUT_ROWS, n))
+    old_line, old_clock, old_wanted = line, clock, wanted
     if not donate:
-        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
-    reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
-    scratch = scratch_for(wanted.shape[1])
-    refused_row, failed_row = step_worlds(
-        line, car, clock, wanted, actions, scratch, out, reward, settings.learners, settings.time_step_s, settings.harm,
-        settings.terminal, settings.weights,
-    )  # fmt: skip
+        line, clock, wanted = np.empty(line.shape), np.empty(clock.shape), np.empty(wanted.shape)
+
+    def step_slice(first: int, end: int) -> tuple[int, int]:
+        rows: tuple[int, int] = step_worlds(
+            old_line, old_clock, old_wanted, not donate, first, end, line, car, clock, wanted, actions,
+            scratch_for(wanted.shape[1]), out, reward, settings.learners, settings.time_step_s, settings.harm,
+            settings.terminal, settings.weights,
+        )  # fmt: skip
+        return rows
+
+    refused_row, failed_row = call_slices(step_slice, n, settings.threads)
     if refused_row >= 0:
         check_actions(settings.learners, actions[refused_row])
     if failed_row >= 0:
@@ -131,22 +140,43 @@ def step(
 
 @large
 def step_worlds(
-    line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, harm, terminal, weights
-):
-    """Advance every running episode by one step, in place; return the index of a refused world and of a failed world.
+    old_line, old_clock, old_wanted, copies, first, end, line, car, clock, wanted, actions, scratch, out, reward,
+    learners, time_step_s, harm, terminal, weights,
+):  # fmt: skip
+    """Advance the running episodes ``first`` to ``end - 1`` by one step, in place.
 
-    -1 stands for none. A world is refused if an action is not a number in [-1, 1]; then no world has moved. It fails if
-    a check of the physics fails. ``line``, ``car``, ``clock`` and ``wanted`` are arrays of a ``State``, ``out`` and
-    ``reward`` of a ``Step``; ``scratch`` is the working memory of the physics. ``harm`` and ``terminal`` are weights of
-    the reward; ``weights`` [6] belong to the count of harm in the reward (``COUNTS``).
+    Returns the index of a refused world and of a failed world; -1 stands for none. A world is refused if an action is
+    not a number in [-1, 1]; then no world of the batch has moved. It fails if a check of the physics fails. ``line``,
+    ``car``, ``clock`` and ``wanted`` are arrays of a ``State``, ``out`` and ``reward`` of a ``Step``; if ``copies``,
+    ``line``, ``clock`` and ``wanted`` get the contents of ``old_line``, ``old_clock`` and ``old_wanted`` first.
+    ``scratch`` is the working memory of the physics. ``harm`` and ``terminal`` are weights of the reward; ``weights``
+    [6] belong to the count of harm in the reward (``COUNTS``).
     """
-    n, bodies = wanted.shape
-    for k in range(n):
+    for k in range(len(actions)):
         for c in range(learners.shape[0]):
             if not -LARGEST_ACTION <= actions[k, c] <= LARGEST_ACTION:
                 return k, -1
-    failed = -1
-    for k in range(n):
+    if is_line_of_three(line, car, wanted, scratch):
+        return -1, step_rows(
+            old_line, old_clock, old_wanted, copies, first, end, line, car, clock, wanted, actions, scratch, out,
+            reward, learners, time_step_s, harm, terminal, weights,
+        )  # fmt: skip
+    return -1, step_rows(
+        old_line, old_clock, old_wanted, copies, first, end, line, car, clock, wanted, actions, scratch, out, reward,
+        learners, time_step_s, harm, terminal, weights,
+    )  # fmt: skip
+
+
+@kernel
+def step_rows(
+    old_line, old_clock, old_wanted, copies, first, end, line, car, clock, wanted, actions, scratch, out, reward,
+    learners, time_step_s, harm, terminal, weights,
+):  # fmt: skip
+    """Advance running episodes as ``step_worlds`` does; return the index of a failed world, or -1."""
+    bodies, failed = wanted.shape[1], -1
+    for k in range(first, end):
+        if copies:
+            copy_world(old_line[k], old_clock[k], old_wanted[k], line[k], clock[k], wanted[k])
         for row in range(out.shape[0]):
             out[row, k] = 0.0
         for i in range(bodies - 1):
@@ -174,7 +204,19 @@ def step_worlds(
         out[COST, k] = cost
         for i in range(bodies - 1):
             reward[k, i] = shared
-    return -1, failed
+    return failed
+
+
+@kernel
+def copy_world(old_line, old_clock, old_wanted, line, clock, wanted):
+    """Copy one world's arrays that a step changes."""
+    for row in range(line.shape[0]):
+        for i in range(line.shape[1]):
+            line[row, i] = old_line[row, i]
+    for i in range(wanted.shape[0]):
+        wanted[i] = old_wanted[i]
+    for column in range(clock.shape[0]):
+        clock[column] = old_clock[column]
 
 
 @kernel

@@ -43,6 +43,7 @@ def make_sb3_vec_env(
     actions: int | None = None,
     report: Sequence[str] = (),
     max_cycles: int | None = None,
+    threads: int | None = None,
 ) -> EthBrakeVecEnv:
     """Environment for Stable-Baselines3 with ``n_envs`` worlds, simulated together.
 
@@ -57,13 +58,14 @@ def make_sb3_vec_env(
       ``state``.
     - ``step_infos``: return infos at every step, not only at the last one.
     - ``render_mode``: ``ansi`` or ``rgb_array``; None: no pictures.
+    - ``threads``: as in ``open_game``.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
     (4, 27)
     """
     check_whole_number("n_envs", n_envs, 1)
-    scenario_and_game = open_game(scenario, learners, reward, observation, report=report)
+    scenario_and_game = open_game(scenario, learners, reward, observation, report=report, threads=threads)
     return EthBrakeVecEnv(
         *scenario_and_game, int(n_envs), seed, horizon_is_end, appended, step_infos, render_mode, actions, max_cycles
     )

@@ -26,7 +26,8 @@ import llvmlite
 import numba
 from numba.core import event
 from numba.core.caching import NullCache
-from numba.core.compiler import CompileResult
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.serialize import dumps
 
@@ -101,13 +102,34 @@ def _compile(function: Function, **options: Any) -> Function:
     return compiled
 
 
+class _PartLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """Code of a part of other kernels. They contain it and optimise it, so it is not optimised alone."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+
+class _PartCompiler(Compiler):  # type: ignore[misc]
+    """Numba's compiler, with a ``_PartLibrary``."""
+
+    def compile_extra(self, function: Callable[..., Any]) -> CompileResult:
+        self.state.library = _PartLibrary(self.state.targetctx.codegen(), function.__qualname__)
+        self.state.library.enable_object_caching()
+        return super().compile_extra(function)
+
+
 def kernel(function: Function) -> Function:
-    """Compile a function that is inlined in every kernel that calls it."""
-    return _compile(function, forceinline=True)
+    """Compile a function that is inlined in every kernel that calls it. It is slow if Python code calls it."""
+    return _compile(function, forceinline=True, pipeline_class=_PartCompiler)
+
+
+def shared(function: Function) -> Function:
+    """Compile a function as ``kernel`` does, but without inlining it: for long functions with several callers."""
+    return _compile(function, pipeline_class=_PartCompiler)
 
 
 def large(function: Function) -> Function:
-    """Compile a function once, without inlining it. Kernels and Python code may call it."""
+    """Compile a function that Python code calls. Kernels may call it, too."""
     return _compile(function)
 
 

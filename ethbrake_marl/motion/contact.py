@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.compiling import kernel, shared
 
 
 @kernel
@@ -39,7 +39,7 @@ def contact(gap, closing, pressing):
     return math.inf, 0.0
 
 
-@large
+@shared
 def contact_on_cubic(gap, closing, pressing, jerk, end):
     """Time (s) and closing speed (m/s) of a pair's first contact before ``end`` (s); ``(inf, 0)`` if there is none.
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.compiling import kernel, large, shared
 from ethbrake_marl.motion.contact import contact, contact_on_cubic, first_return, gap_after
 from ethbrake_marl.motion.forces import acts, driving, force_now, force_range, plan_force, settle
 from ethbrake_marl.motion.impact import pool, resolve_impacts
@@ -73,7 +73,7 @@ def crossing_s(below, rate):
     return math.inf if rate <= 0.0 else max(-below / rate, 0.0) + LATE_S + LATE_MPS2 / rate
 
 
-@large
+@shared
 def parting_s(car, scratch, head, tail):
     """Time (s) until the bodies ``head..tail``, which move as one block, part or start to move; infinite: never.
 
@@ -333,7 +333,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
     return outcome
 
 
-@large
+@shared
 def through_interval_building(line, car, scratch, start, until, ahead):
     """``through_interval`` for a line in which some force follows its command at a finite rate."""
     return through_interval(line, car, scratch, start, until, ahead, True)
@@ -372,6 +372,16 @@ def move_line(line, car, wanted, scratch, start, until):
     if builds:
         return through_interval_building(line, car, scratch, start, until, ahead)
     return through_interval(line, car, scratch, start, until, ahead, False)
+
+
+@kernel
+def is_line_of_three(line, car, wanted, scratch):
+    """Whether arrays of n worlds (``scratch``: of one call) belong to lines of three vehicles.
+
+    Where this is True, the number of bodies is a constant for the compiler: it unrolls loops, and addresses are sums of
+    constants. So kernels that are called often contain their text twice, with this condition before the first.
+    """
+    return line.shape[2] == 4 and car.shape[2] == 4 and wanted.shape[1] == 4 and scratch.shape[1] == 4
 
 
 @large

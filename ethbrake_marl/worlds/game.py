@@ -16,6 +16,7 @@ from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.threads import chosen_threads
 from ethbrake_marl.errors import FreeImpacts
 from ethbrake_marl.worlds.physics import PHYSICS
 from ethbrake_marl.worlds.scenario import Scenario
@@ -48,11 +49,13 @@ def game_of(
     observation: Any = None,
     reward_vector: Any = None,
     report: Sequence[str] = (),
+    threads: int | None = None,
 ) -> tuple[Scenario, Game]:
     """The scenario with this ``observation``, and its game. ``names.open_game`` finds scenario and scripts by name.
 
-    ``scripts``: vehicle (1: Vehicle 1) -> script, for vehicles whose role is the name of an agent. Other arguments as
-    in ``EthBrakeParallelEnv``. Warns (``FreeImpacts``) if an impact costs nothing under a learner's objective.
+    ``scripts``: vehicle (1: Vehicle 1) -> script, for vehicles whose role is the name of an agent. ``threads`` as in
+    ``open_game``, other arguments as in ``EthBrakeParallelEnv``. Warns (``FreeImpacts``) if an impact costs nothing
+    under a learner's objective.
     """
     if observation is not None:
         current_features = {
@@ -66,6 +69,7 @@ def game_of(
         reward, scenario.objective, scenario.vehicles, bodies, (scenario.time_step_s, scenario.horizon_s),
         reward_vector, report,
     )  # fmt: skip
+    settings = settings._replace(threads=chosen_threads(threads))
     if rewarding.params.harm:
         _warn_of_ties(scenario, rewarding.params.objective or scenario.objective)
     views = (View(), *views_of(scenario))

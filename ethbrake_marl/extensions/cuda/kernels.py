@@ -149,8 +149,9 @@ def play_world(t, memory, stored, pool, following, actions, results, settings, v
             action = float(actions[t, j])
             memory.actions[0, j] = 1.0 if action > 1.0 else (-1.0 if action < -1.0 else action)
         refused, failed = step_worlds(
-            memory.line, memory.car, memory.clock, memory.wanted, memory.actions, memory.scratch, memory.out,
-            memory.reward, settings.learners, settings.time_step_s, settings.harm, settings.terminal, settings.weights,
+            memory.line, memory.clock, memory.wanted, False, 0, 1, memory.line, memory.car, memory.clock, memory.wanted,
+            memory.actions, memory.scratch, memory.out, memory.reward, settings.learners,
+            settings.time_step_s, settings.harm, settings.terminal, settings.weights,
         )  # fmt: skip
         for row in range(memory.out.shape[0]):
             results.out[row, t] = memory.out[row, 0] if refused < 0 else 0.0
