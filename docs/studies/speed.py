@@ -110,16 +110,20 @@ def braking(n: int, share: float) -> Work:
 
 
 def until_rest(game: eb.Game, begun: eb.State, actions: Floats) -> Work:
-    """``Game.step``: motion, harm, rewards and ends of episodes, with constant actions, until all have ended."""
-    state, steps = begun, 0
-    while not state.ended.all() and steps < MOST_STEPS:
-        state, steps = game.step(state, actions)[0], steps + 1
+    """``Game.step``: motion, harm, rewards and ends of episodes, with constant actions, until all have ended.
+
+    Only steps of running episodes count: a step of an episode that has ended costs almost nothing.
+    """
+    state, running = begun, []
+    while not state.ended.all() and len(running) < MOST_STEPS:
+        running.append(int((~state.ended).sum()))
+        state, _ = game.step(state, actions)
 
     def work() -> int:
         now = begun
-        for _ in range(steps):
+        for _ in running:
             now, _ = game.step(now, actions)
-        return steps * begun.n
+        return sum(running)
 
     return work
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from tests.docs.site import load
 
 SPEED = load("../studies/speed")
@@ -41,6 +42,9 @@ def test_calibration__brakes_by_half_a_metre_per_second_and_starts_again() -> No
     assert (speeds == 20.0).all()
 
 
-def test_braking__counts_the_steps_of_all_worlds_until_all_are_at_rest() -> None:
-    assert SPEED.braking(2, 0.75)() == 78  # 39 steps, in two worlds
-    assert SPEED.braking(2, 0.1)() == 128
+def test_braking__counts_the_steps_of_running_worlds_until_all_are_at_rest() -> None:
+    scenario, game = eb.open_game("paper-random")
+    state = game.reset(scenario.sample(2, seed=7))
+    while not state.ended.all():
+        state, _ = game.step(state, np.full((2, 1), -0.75))
+    assert SPEED.braking(2, 0.75)() == state.steps.sum() < 78  # the last world is at rest after 39 steps
