@@ -219,6 +219,15 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, p
     observer, in the order own, neighbours, role, obstacle. ``places`` [F] has the position in ``value`` of each feature
     of ``out`` (-1: the feature is not written); if ``places`` is empty, all values are written in order.
     """
+    if line.shape[2] == 4 and car.shape[2] == 4 and know.shape[2] == 4:  # as in `is_line_of_three`
+        write_observations(line, car, clock, know, observers, offsets, role, obstacle, places, scaling, value, out)
+    else:
+        write_observations(line, car, clock, know, observers, offsets, role, obstacle, places, scaling, value, out)
+
+
+@kernel
+def write_observations(line, car, clock, know, observers, offsets, role, obstacle, places, scaling, value, out):
+    """Write features as ``observe_worlds`` does."""
     bodies = line.shape[2]
     for k in range(len(out)):
         w, c, time = line[k], car[k], clock[k, TIME]
