@@ -38,7 +38,7 @@ class WorldPool:
         if worlds is None or seed != self.seed or not self.first <= first or first + n > self.first + worlds.n:
             worlds = self.scenario.sample(max(4 * n, WORLDS_AT_ONCE), seed, first=first, purpose="training")
             self.worlds, self.seed, self.first = worlds, seed, first
-        return worlds.take(np.arange(first - self.first, first - self.first + n))
+        return worlds.take(slice(first - self.first, first - self.first + n))
 
 
 def game_of(
