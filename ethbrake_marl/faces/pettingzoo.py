@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 from pettingzoo import ParallelEnv
-from pettingzoo.utils.conversions import parallel_to_aec
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.observe import Observations
@@ -199,6 +200,41 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 parallel_env = EthBrakeParallelEnv
 
 
+class Turns(parallel_to_aec_wrapper):  # type: ignore[misc]
+    """PettingZoo's conversion into turns, without its copies: all agents end together, and a step's results are new."""
+
+    agents: list[str]
+    agent_selection: str
+    terminations: dict[str, bool]
+    truncations: dict[str, bool]
+
+    def step(self, action: Any) -> None:
+        """Take the turn of the selected agent. The last turn of a round moves all vehicles."""
+        agent = self.agent_selection
+        if agent != self.agents[-1] or self.terminations[agent] or self.truncations[agent]:
+            super().step(action)
+            return
+        self._actions[agent] = action
+        answer = self.env.step(self._actions)
+        self._observations, self.rewards, self.terminations, self.truncations, self.infos = answer
+        self._cumulative_rewards = dict(self.rewards)
+        if self.env.agents:
+            self.agent_selection = self._agent_selector.reset()
+        else:
+            self.agents = sorted(self.agents)
+            self._deads_step_first()
+
+
+class OrderedTurns(OrderEnforcingWrapper):  # type: ignore[misc]
+    """PettingZoo's check of the order of calls, with a ``last`` that looks up fewer attributes."""
+
+    def last(self, observe: bool = True) -> tuple[Any, ...]:
+        return self.env.last(observe) if self._has_reset else super().last(observe)  # type: ignore[no-any-return]
+
+    def __str__(self) -> str:
+        return str(self.env)
+
+
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> Any:
     """Environment in PettingZoo's AEC form (agents act in turns, front to rear), with arguments of ``parallel_env``.
 
@@ -211,7 +247,7 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> Any:
     'vehicle_1'
 
     """
-    return parallel_to_aec(parallel_env(scenario, **settings))
+    return OrderedTurns(Turns(parallel_env(scenario, **settings)))
 
 
 env = raw_env
