@@ -32,97 +32,109 @@ from ethbrake_marl.episode.step import Step
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import FIRST, FORCE, IMPACTS, MASS, TOTAL, Floats, Ints
 
-NUMBERS = (
-    "time_s",
-    "command_in_force_mps2",
-    "first_impact_harm",
-    "total_harm",
-    "world_first_impact_harm",
-    "world_total_harm",
-    "collided",
-    "chosen_command_mps2",
-    "chosen_action",
-)
-TIME_NOW, FORCE_NOW, BORNE_FIRST, BORNE_TOTAL, LINE_FIRST, LINE_TOTAL, COLLIDED, COMMAND, ACTION = range(len(NUMBERS))
+# rows of `out`
+(
+    TIME_NOW, FORCE_NOW, BORNE_FIRST, BORNE_TOTAL, LINE_FIRST, LINE_TOTAL, COLLIDED, COMMAND, ACTION, LISTED, WORLD,
+) = range(11)  # fmt: skip
+OUT_ROWS = 11
 FIRST_WEIGHTS, TOTAL_WEIGHTS = COUNTS["first"], COUNTS["total"]
 
 
 @large
 def report(line, car, clock, wanted, bodies, borne, out):
-    """Write the infos in ``NUMBERS`` of the ``bodies`` to ``out`` [n, bodies, len(NUMBERS)].
+    """Write the infos of the B ``bodies`` that follow from the state to ``out`` [OUT_ROWS, n, B].
 
     ``line``, ``car``, ``clock`` and ``wanted`` are arrays of a ``State``; ``borne`` [2, N] is working memory.
     """
-    for k in range(len(out)):
+    for k in range(out.shape[1]):
         split_world(line[k, FIRST], car[k, MASS], borne[0])
         split_world(line[k, TOTAL], car[k, MASS], borne[1])
         first, total = amount_so_far(line[k], FIRST_WEIGHTS), amount_so_far(line[k], TOTAL_WEIGHTS)
-        impacts = 0.0
+        impacts, number = 0.0, clock[k, NUMBER]
+        listed = number <= FIRST_IN_LIST
         for p in range(line.shape[2] - 1):
             impacts += line[k, IMPACTS, p]
         for o in range(len(bodies)):
             i = bodies[o]
-            info, time, command = out[k, o], clock[k, TIME], wanted[k, i]
+            info, time, command = out[:, k, o], clock[k, TIME], wanted[k, i]
             info[TIME_NOW], info[FORCE_NOW], info[COLLIDED] = time, line[k, FORCE, i], 1.0 if impacts > 0.0 else 0.0
             info[BORNE_FIRST], info[BORNE_TOTAL] = borne[0, i - 1], borne[1, i - 1]
             info[LINE_FIRST], info[LINE_TOTAL] = first, total
             info[COMMAND], info[ACTION] = command, action_of(car[k], i, command, time)
+            info[WORLD], info[LISTED] = FIRST_IN_LIST - number if listed else number, 1.0 if listed else 0.0
 
 
 def numbers(state: State, bodies: Ints) -> Floats:
-    out = np.empty((state.n, len(bodies), len(NUMBERS)))
+    """Infos of the B ``bodies`` that follow from the state, [OUT_ROWS, n, B]."""
+    out = np.empty((OUT_ROWS, state.n, len(bodies)))
     report(state.line, state.car, state.clock, state.wanted, bodies, np.empty((2, state.vehicles)), out)
     return out
 
 
-def names_of_worlds(state: State, seed: Any) -> dict[str, Any]:
-    """Infos ``world_seed``, ``world`` and ``world_listed``, name -> [n]. ``seed``: a number for all worlds, or [n]."""
-    number = state.clock[:, NUMBER].astype(np.int64)
-    in_evaluation_list = number <= FIRST_IN_LIST
-    number_in_list = np.where(in_evaluation_list, FIRST_IN_LIST - number, number)
-    return {"world_seed": np.full(state.n, seed), "world": number_in_list, "world_listed": in_evaluation_list}
+def named(values: Any, world: Any, cost: Any, seed: Any) -> dict[str, Any]:
+    """Infos without reward terms, of one vehicle in one world (numbers) or in n worlds (arrays [n]).
 
-
-def of_step(game: Game, state: State, step: Step | None, seed: Any) -> dict[str, Any]:
-    """Infos of the last step: cost, reward terms, seed and number of the world; name -> [n] or [n, N].
-
-    ``step`` is None after a reset; cost and terms are then 0.
+    ``values``: the rows of ``numbers`` before the last one, ``WORLD``. ``world``: number of the world, a whole number.
     """
+    time, force, borne_first, borne_total, line_first, line_total, collided, command, action, listed = values
+    return {
+        "time_s": time,
+        "command_in_force_mps2": force,
+        "first_impact_harm": borne_first,
+        "total_harm": borne_total,
+        "world_first_impact_harm": line_first,
+        "world_total_harm": line_total,
+        "collided": collided == 1.0,
+        "chosen_command_mps2": command,
+        "chosen_action": action,
+        "cost": cost,
+        "world_seed": seed,
+        "world": world,
+        "world_listed": listed == 1.0,
+    }
+
+
+def reward_infos(game: Game, state: State, step: Step | None) -> dict[str, Floats]:
+    """Terms of the reward in the last step, ``reward_NAME`` -> [n] or [n, N]; 0 after a reset (``step`` is None)."""
     reported = game.rewarding.reported
-    worlds = names_of_worlds(state, seed)
     if step is None:
-        nothing = np.zeros(state.n)
-        return {"cost": nothing, **worlds, **{f"reward_{name}": nothing for name in reported}}
+        return {f"reward_{name}": np.zeros(state.n) for name in reported}
     terms = step.terms or game.rewarding.shared(step)
-    return {"cost": step.cost, **worlds, **{f"reward_{name}": terms[name] for name in reported}}
+    return {f"reward_{name}": terms[name] for name in reported}
 
 
-def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:
-    """Infos of the ``bodies`` in all worlds: a list of dictionaries, one for each world and body, world by world."""
-    infos = []
-    shared = per_body(of_step(game, state, step, seed) | game.extra_infos(state), state.n, bodies)
-    for values, common in zip(numbers(state, bodies).reshape(-1, len(NUMBERS)).tolist(), shared, strict=True):
-        info = dict(zip(NUMBERS, values, strict=True))
-        info["collided"] = values[COLLIDED] == 1.0
-        infos.append(info | common)
+def dictionaries(game: Game, state: State, step: Step | None, seed: Any, bodies: Ints) -> list[dict[str, Any]]:
+    """Infos of the ``bodies`` in all worlds: a list of dictionaries, one for each world and body, world by world.
+
+    ``step`` is None after a reset; cost and terms are then 0. ``seed``: an int for all worlds, or [n].
+    """
+    infos, vehicles = [], len(bodies)
+    seeds = [seed] * state.n if isinstance(seed, int) else seed.tolist()
+    costs = [0.0] * state.n if step is None else step.cost.tolist()
+    columns = lists_by_body(reward_infos(game, state, step) | game.extra_infos(state), bodies)
+    for k, (*values, world) in enumerate(numbers(state, bodies).reshape(OUT_ROWS, -1).T.tolist()):
+        info = named(values, int(world), costs[k // vehicles], seeds[k // vehicles])
+        for name, column in columns.items():
+            info[name] = column[k]
+        infos.append(info)
     return infos
 
 
-def per_body(columns: dict[str, Any], n: int, bodies: Ints) -> list[dict[str, Any]]:
-    """Split ``columns``, [n] or [n, N] each, into one dictionary for each world and body, world by world."""
-    shared = {name: value.tolist() for name, value in columns.items() if value.ndim == 1}
-    vehicle_columns = {name: value[:, bodies - 1].tolist() for name, value in columns.items() if value.ndim == 2}
-    rows = []
-    for k in range(n):
-        common = {name: column[k] for name, column in shared.items()}
-        rows += [common | {name: column[k][o] for name, column in vehicle_columns.items()} for o in range(len(bodies))]
-    return rows
+def lists_by_body(columns: dict[str, Any], bodies: Ints) -> dict[str, list[Any]]:
+    """Lists with a value for each world and body, world by world, from ``columns``, [n] or [n, N] each.
+
+    The columns of worlds come first, then those of vehicles.
+    """
+    lists = {name: value.repeat(len(bodies)).tolist() for name, value in columns.items() if value.ndim == 1}
+    of_vehicles = {name: value[:, bodies - 1] for name, value in columns.items() if value.ndim == 2}
+    return lists | {name: value.reshape(-1).tolist() for name, value in of_vehicles.items()}
 
 
-def arrays(game: Game, state: State, step: Step | None, seed: int, body: int) -> dict[str, Any]:
-    """Infos of one body in all worlds: name -> [n]."""
-    columns = dict(zip(NUMBERS, numbers(state, np.array([body]))[:, 0].T, strict=True))
-    columns["collided"] = columns["collided"] == 1.0
-    for name, value in (of_step(game, state, step, seed) | game.extra_infos(state)).items():
-        columns[name] = value if value.ndim == 1 else value[:, body - 1]
+def arrays(game: Game, state: State, step: Step | None, seed: Any, bodies: Ints) -> dict[str, Any]:
+    """Infos of the body in ``bodies`` [1] in all worlds: name -> a new array [n]. Arguments as in ``dictionaries``."""
+    *values, world = numbers(state, bodies)[:, :, 0]
+    cost = np.zeros(state.n) if step is None else step.cost.copy()
+    columns = named(values, world.astype(np.int64), cost, np.full(state.n, seed))
+    for name, value in (reward_infos(game, state, step) | game.extra_infos(state)).items():
+        columns[name] = (value if value.ndim == 1 else value[:, bodies[0] - 1]).copy()
     return columns

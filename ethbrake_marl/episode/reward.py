@@ -293,8 +293,8 @@ class Rewarding(NamedTuple):
 
     def shared(self, step: Step) -> dict[str, Floats]:
         """Values of the terms that the compiled step computes, name -> [n]."""
-        term_values = {"harm": -step.cost, "terminal": step.out[SAFE_END]}
-        return {name: value for name, value in term_values.items() if name in self.reported}
+        names = [name for name in ("harm", "terminal") if name in self.reported]
+        return {name: -step.cost if name == "harm" else step.out[SAFE_END] for name in names}
 
 
 def _wide(value: Floats) -> Floats:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from pettingzoo import ParallelEnv
-from pettingzoo.utils.conversions import parallel_to_aec
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import ENDED, State
+from ethbrake_marl.episode.step import TERMINATED, TRUNCATED
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import Metadata
@@ -75,7 +79,6 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 
     """
 
-    np_random = np.random.default_rng()  # for wrappers that draw
     metadata: Any = Metadata(name="ethbrake_v2", is_parallelizable=True)
 
     def __init__(
@@ -99,7 +102,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         names, learning = self.scenario.vehicle_names, self.game.settings.learners
         self.actions, self.bodies = actions, np.arange(1, len(names) + 1) if agents == "all" else learning
         self.possible_agents = [names[i - 1] for i in self.bodies]
-        self._learners = {names[i - 1]: c for c, i in enumerate(learning)}
+        self._rows = {names[i - 1]: i - 1 for i in self.bodies}  # of an agent's vehicle in the arrays of a step
+        self._learners = [names[i - 1] for i in learning]
         views = [self.game.views[i] for i in self.bodies]
         self._alike = len(set(views)) == 1
         self.observation_spaces = dict(zip(self.possible_agents, (feature_box(v.features) for v in views), strict=True))
@@ -107,6 +111,12 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         self.state_space = feature_box(state_features(len(names), *self._of_state))
         if components := self.game.rewarding.components:  # as MOMAland has it
             self.reward_spaces = {agent: reward_box(components) for agent in self.possible_agents}
+
+    @cached_property
+    def np_random(self) -> np.random.Generator:
+        """Random numbers for wrappers that draw; the same ones after each reset to the same world of a seed."""
+        seed = self.stream.seed
+        return np.random.default_rng(None if seed is None else [seed, self.stream.next])
 
     @property
     def agents(self) -> list[str]:
@@ -137,7 +147,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         stream, state = self.stream.reset(1, None if seed is None else chosen_seed(seed), options)
         answer = self._observations(state), self._by_agent(self._infos(stream, state, None))
         self._keep(stream, state, self.renderer.began)
-        self.np_random = np.random.default_rng([stream.seed, stream.next])
+        self.__dict__.pop("np_random", None)
         return answer
 
     def step(
@@ -145,12 +155,12 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     ) -> tuple[dict[str, Observations], dict[str, Any], dict[str, bool], dict[str, bool], Infos]:
         """Advance by one time step. Raises ``InvalidInput`` for a missing or bad action of a learner."""
         state, step = self._advance(self._columns(actions))
-        rewards = self._rewards(step)[0]
+        rewards = step.reward[0].tolist() if step.vector is None else step.vector[0]
         answer = (
             self._observations(state),
-            self._by_agent(rewards.tolist() if step.vector is None else [*rewards]),
-            dict.fromkeys(self.possible_agents, bool(step.terminated[0])),
-            dict.fromkeys(self.possible_agents, bool(step.truncated[0])),
+            {agent: rewards[row] for agent, row in self._rows.items()},
+            dict.fromkeys(self.possible_agents, bool(step.out[TERMINATED, 0])),
+            dict.fromkeys(self.possible_agents, bool(step.out[TRUNCATED, 0])),
             self._by_agent(self._infos(self.stream, state, step)),
         )
         self._keep(self.stream, state, self.renderer.stepped)
@@ -170,14 +180,13 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         for agent in actions:
             if agent not in self.action_spaces:
                 raise unknown_name("agent", agent, self.possible_agents)
-        columns = np.full((1, len(self._learners)), np.nan)
-        for agent, c in self._learners.items():
+        columns = []
+        for agent in self._learners:
             action = actions.get(agent)
-            if action is not None:
-                columns[0, c] = checked_actions(action, (1,), agent, self.actions)[0]
-            elif self.game.shield is None:
+            if action is None and self.game.shield is None:
                 raise InvalidInput(f"step: the action of learner {agent} is missing")
-        return columns
+            columns.append(math.nan if action is None else checked_actions(action, (1,), agent, self.actions).item())
+        return np.array([columns])
 
     def _observations(self, state: State) -> dict[str, Observations]:
         if self._alike:
@@ -185,10 +194,45 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return self._by_agent([observation[0] for observation in self.game.observe(state, self.bodies)])
 
     def _by_agent(self, values: Any) -> dict[str, Any]:
-        return dict(zip(self.possible_agents, values, strict=True))
+        return {agent: values[k] for k, agent in enumerate(self.possible_agents)}
 
 
 parallel_env = EthBrakeParallelEnv
+
+
+class Turns(parallel_to_aec_wrapper):  # type: ignore[misc]
+    """PettingZoo's conversion into turns, without its copies: all agents end together, and a step's results are new."""
+
+    agents: list[str]
+    agent_selection: str
+    terminations: dict[str, bool]
+    truncations: dict[str, bool]
+
+    def step(self, action: Any) -> None:
+        """Take the turn of the selected agent. The last turn of a round moves all vehicles."""
+        agent = self.agent_selection
+        if agent != self.agents[-1] or self.terminations[agent] or self.truncations[agent]:
+            super().step(action)
+            return
+        self._actions[agent] = action
+        answer = self.env.step(self._actions)
+        self._observations, self.rewards, self.terminations, self.truncations, self.infos = answer
+        self._cumulative_rewards = dict(self.rewards)
+        if self.env.agents:
+            self.agent_selection = self._agent_selector.reset()
+        else:
+            self.agents = sorted(self.agents)
+            self._deads_step_first()
+
+
+class OrderedTurns(OrderEnforcingWrapper):  # type: ignore[misc]
+    """PettingZoo's check of the order of calls, with a ``last`` that looks up fewer attributes."""
+
+    def last(self, observe: bool = True) -> tuple[Any, ...]:
+        return self.env.last(observe) if self._has_reset else super().last(observe)  # type: ignore[no-any-return]
+
+    def __str__(self) -> str:
+        return str(self.env)
 
 
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> Any:
@@ -203,7 +247,7 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> Any:
     'vehicle_1'
 
     """
-    return parallel_to_aec(parallel_env(scenario, **settings))
+    return OrderedTurns(Turns(parallel_env(scenario, **settings)))
 
 
 env = raw_env

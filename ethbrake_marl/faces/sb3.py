@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.infos import per_body
+from ethbrake_marl.episode.infos import lists_by_body
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State, put_rows
 from ethbrake_marl.episode.step import Step
@@ -156,13 +156,15 @@ class EthBrakeVecEnv(Face, VecEnv):
         """Advance every world by one time step; where an episode ends, the next one begins in the same rows."""
         actions = checked_actions(self._given, (self.num_envs, 1), "the learners", self.actions)
         state, step = self._advance(actions.reshape(self.n, -1))
-        stream, observations, ended = self.stream, self._observe(state), np.flatnonzero(state.ended)
+        stream, observations, over = self.stream, self._observe(state), state.ended
+        ended = np.flatnonzero(over)
         reward = self._rewards(step).reshape(-1)
         first, returns, steps = self._first, self._return + reward, self._steps + 1
         if self.step_infos:
             infos = self._infos(stream, state, step)
         elif self.game.shield is not None:
-            infos = per_body(self.game.extra_infos(state), self.n, self.bodies)
+            lists = lists_by_body(self.game.extra_infos(state), self.bodies)
+            infos = [{name: column[k] for name, column in lists.items()} for k in range(self.num_envs)]
         else:
             infos = [{} for _ in range(self.num_envs)]
         if len(ended):
@@ -177,8 +179,7 @@ class EthBrakeVecEnv(Face, VecEnv):
             state, first = (put_rows(states, ended, new, donate=self.render_mode is None) for states in (state, first))
         self._keep(stream, state, self.renderer.stepped)
         self._first, self._return, self._steps = first, returns, steps
-        over = (step.terminated | step.truncated).repeat(len(self.bodies))
-        return observations, reward.astype(np.float32), over, infos
+        return observations, reward.astype(np.float32), over.repeat(len(self.bodies)), infos
 
     def _last_infos(self, state: State, step: Step, ended: Any) -> list[dict[str, Any]]:
         """Infos of each learner at the end of an episode, in the worlds ``ended`` (indices).

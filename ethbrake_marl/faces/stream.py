@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.infos import names_of_worlds
+from ethbrake_marl.episode.infos import WORLD, numbers
 from ethbrake_marl.episode.state import FIRST_IN_LIST, NUMBER, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Ints
@@ -86,15 +86,15 @@ class Stream(NamedTuple):
 
     def describe(self, state: State) -> dict[str, Any]:
         """Drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
-        numbers, seeds = state.clock[:, NUMBER].astype(np.int64), np.full(state.n, self.seed, object)
+        index, seeds = state.clock[:, NUMBER].astype(np.int64), np.full(state.n, self.seed, object)
         place, parts = np.arange(state.n), [] if self.option_worlds is None else [self.option_worlds[0]]
-        of_stream = np.flatnonzero(numbers >= 0)
+        of_stream = np.flatnonzero(index >= 0)
         place[of_stream] = np.arange(len(of_stream)) + len(parts) * state.n
-        parts += [self.scenario.draw(1, int(seeds[k]), first=int(numbers[k]), purpose="training") for k in of_stream]
+        parts += [self.scenario.draw(1, int(seeds[k]), first=int(index[k]), purpose="training") for k in of_stream]
         drawn_worlds = merge_draws(parts, np.arange(sum(part.worlds.n for part in parts)))
         columns = {name: column[place] for name, column in columns_of(drawn_worlds).items()}
-        names = names_of_worlds(state, self.seeds_of(state))
-        return {**columns, "world_seed": names["world_seed"], "world": names["world"]}
+        world = numbers(state, np.array([1]))[WORLD, :, 0].astype(np.int64)
+        return {**columns, "world_seed": np.full(state.n, self.seeds_of(state)), "world": world}
 
     def _worlds_of_options(self, n: int, options: Any) -> tuple[DrawnWorlds, int] | None:
         """Worlds that ``options`` of a reset specify, and their seed (-1: no seed); None if there are none."""

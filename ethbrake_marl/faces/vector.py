@@ -11,14 +11,14 @@ from gymnasium.vector.utils import batch_space
 
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.observe import Observations
-from ethbrake_marl.episode.state import State, put_rows
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.faces.gymnasium import OneLearner
 from ethbrake_marl.faces.rendering import render_metadata
 from ethbrake_marl.faces.spaces import checked_actions
 from ethbrake_marl.faces.stream import Stream
-from ethbrake_marl.motion.layout import Bools, Floats
+from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.game import AnyScenario
 
 
@@ -82,31 +82,29 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         ``{"listed_world": {"seed": 7, "number": 3}}`` row k has world 3 + k of the list.
         """
         stream, state = self.stream.reset(self.num_envs, seed, options)
-        answer = self._observe(state), with_masks(self._columns(stream, state, None), np.ones(self.num_envs, np.bool_))
+        answer = self._observe(state), with_masks(self._columns(stream, state, None))
         self._keep(stream, state, self.renderer.began)
         super().reset(seed=None if seed is None else int(np.ravel(stream.seed)[0]))
         return answer
 
     def step(self, actions: Any) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with ``actions`` [n, 1]."""
-        same, renewed = self.autoreset_mode is AutoresetMode.SAME_STEP, self._begun("step").ended
+        same, rows = self.autoreset_mode is AutoresetMode.SAME_STEP, np.flatnonzero(self._begun("step").ended)
         numbers = checked_actions(actions, (self.num_envs, 1), "the learners", self.actions)
-        numbers[renewed] = 0.0  # the action of a row that begins again is ignored
+        numbers[rows] = 0.0  # the action of a row that begins again is ignored
         state, step = self._advance(numbers)
         stream, observations, columns = self.stream, self._observe(state), self._columns(self.stream, state, step)
-        infos = with_masks(columns, np.ones(self.num_envs, np.bool_))
-        if same and state.ended.any():
-            renewed, final = state.ended, np.full(self.num_envs, None, dtype=object)
-            for row, last in zip(np.flatnonzero(renewed), observations[renewed], strict=True):
-                final[row] = last
-            infos |= {"final_obs": final, "_final_obs": renewed}
-            infos |= {"final_info": with_masks(columns, renewed), "_final_info": renewed.copy()}
-        if renewed.any():
-            stream, new = stream.next_episodes(np.flatnonzero(renewed))
-            observations[renewed] = self._observe(new)
-            fresh = self._columns(stream, new, None, renewed)
-            put_rows({name: infos[name] for name in fresh}, renewed, fresh, donate=True)
-            state = state.put(renewed, new, donate=self.render_mode is None)
+        infos = with_masks(columns)
+        if same:
+            rows = np.flatnonzero(state.ended)
+        if same and len(rows):
+            infos |= final_infos(observations, columns, rows)
+        if len(rows):
+            stream, new = stream.next_episodes(rows)
+            observations[rows] = self._observe(new)
+            for name, column in self._columns(stream, new, None, rows).items():
+                infos[name][rows] = column
+            state = state.put(rows, new, donate=self.render_mode is None)
         self._keep(stream, state, self.renderer.stepped)
         return observations, self._rewards(step)[:, 0], step.terminated, step.truncated, infos
 
@@ -115,13 +113,24 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         return None if pictures is None else tuple(pictures)
 
     def _columns(self, stream: Stream, state: State, step: Step | None, rows: Any = slice(None)) -> dict[str, Any]:
-        return arrays(self.game, state, step, stream.seeds_of(state, rows), self.bodies[0])
+        return arrays(self.game, state, step, stream.seeds_of(state, rows), self.bodies)
 
 
-def with_masks(columns: dict[str, Any], rows: Bools) -> dict[str, Any]:
-    """Infos in Gymnasium's vector form: arrays of values, each with the mask ``rows`` [n] of its valid rows."""
-    infos: dict[str, Any] = {}
-    for name, column in columns.items():
-        infos[name] = column.copy() if rows.all() else np.where(rows, column, np.zeros((), column.dtype))
-        infos[f"_{name}"] = rows.copy()
+def with_masks(columns: dict[str, Any], rows: Any = slice(None)) -> dict[str, Any]:
+    """Infos in Gymnasium's vector form: the arrays ``columns`` [n], each with a mask [n] of its valid ``rows``."""
+    infos, masks = {}, np.zeros((len(columns), len(columns["time_s"])), np.bool_)
+    masks[:, rows] = True
+    for mask, (name, column) in zip(masks, columns.items(), strict=True):
+        infos[name], infos[f"_{name}"] = column, mask
     return infos
+
+
+def final_infos(observations: Observations, columns: dict[str, Any], rows: Ints) -> dict[str, Any]:
+    """Last observations and infos of the episodes that ended in ``rows``, in Gymnasium's vector form."""
+    final, ended = np.full(len(observations), None, dtype=object), np.zeros(len(observations), np.bool_)
+    for row in rows:
+        final[row] = observations[row].copy()
+    ended[rows] = True
+    last = {name: np.where(ended, column, np.zeros((), column.dtype)) for name, column in columns.items()}
+    infos = {"final_obs": final, "_final_obs": ended, "final_info": with_masks(last, rows)}
+    return infos | {"_final_info": ended.copy()}

@@ -15,31 +15,13 @@ from ethbrake_marl.episode.objectives import Declared, free_pairs, objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.script_calls import guard_scripts
-from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.threads import chosen_threads
 from ethbrake_marl.errors import FreeImpacts
 from ethbrake_marl.worlds.physics import PHYSICS
+from ethbrake_marl.worlds.sampling import WorldPool
 from ethbrake_marl.worlds.scenario import Scenario
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the content of a scenario file
-
-WORLDS_AT_ONCE = 1024  # training worlds that are drawn together: drawing one alone costs as much
-
-
-class WorldPool:
-    """Source of the training worlds of a scenario. It draws many worlds at a time and keeps those not yet used."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self.scenario, self.seed, self.first = scenario, -1, 0
-        self.worlds: State | None = None
-
-    def __call__(self, n: int, seed: int, first: int) -> State:
-        """Copies of the training worlds ``first`` to ``first + n - 1`` of the seed, at the alert."""
-        worlds = self.worlds
-        if worlds is None or seed != self.seed or not self.first <= first or first + n > self.first + worlds.n:
-            worlds = self.scenario.sample(max(4 * n, WORLDS_AT_ONCE), seed, first=first, purpose="training")
-            self.worlds, self.seed, self.first = worlds, seed, first
-        return worlds.take(np.arange(first - self.first, first - self.first + n))
 
 
 def game_of(
@@ -73,7 +55,9 @@ def game_of(
     if rewarding.params.harm:
         _warn_of_ties(scenario, rewarding.params.objective or scenario.objective)
     views = (View(), *views_of(scenario))
-    game = Game(WorldPool(scenario), scenario.name, settings, rewarding, views, bodies, guard_scripts(scripts))
+    game = Game(
+        WorldPool(scenario, "training"), scenario.name, settings, rewarding, views, bodies, guard_scripts(scripts)
+    )
     v2x = (scenario.members or (scenario,))[0].v2x  # members of a mixture have the same
     if v2x.extensions:
         layers = [extension.layer(v2x) for extension in v2x.extensions]

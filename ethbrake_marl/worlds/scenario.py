@@ -33,13 +33,13 @@ from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import V2X
 from ethbrake_marl.worlds.checks import ScenarioWording, check_scenario
-from ethbrake_marl.worlds.counters import Purpose
+from ethbrake_marl.worlds.counters import Purpose, world_numbers
 from ethbrake_marl.worlds.derived import world_values
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS, changed_content, with_members
 from ethbrake_marl.worlds.quantities import OF_A_TYPE, OPTIONAL, QUANTITIES, USUAL, check_length, table_columns
 from ethbrake_marl.worlds.quantity import PerVehicle, Quantity, ScenarioPart, Weight, support
 from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role, check_vehicle, names_of
-from ethbrake_marl.worlds.sampling import DrawnWorlds, draw_worlds
+from ethbrake_marl.worlds.sampling import DrawnWorlds, WorldPool, draw_worlds
 from ethbrake_marl.worlds.table import Table, TableColumn
 from ethbrake_marl.worlds.vehicle_types import Types, TypesOfLine, VehicleTypes
 
@@ -238,7 +238,8 @@ class Scenario(ScenarioPart):
         ``"training"`` for training. Raises ``InvalidInput`` for bad arguments, and if ``early_impacts: reject`` leaves
         no world.
         """
-        return self.draw(n, seed, first=first, purpose=purpose).worlds
+        world_numbers(n, seed, first, purpose)
+        return self.pools[purpose](int(n), int(seed), int(first))
 
     def draw(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> DrawnWorlds:
         """The worlds of ``sample``, with the friction, vehicle types, member of the mixture and recording of each.
@@ -246,6 +247,11 @@ class Scenario(ScenarioPart):
         The result also contains the number of rejected draws.
         """
         return draw_worlds(self, n, seed, first, purpose)
+
+    @cached_property
+    def pools(self) -> dict[Purpose, WorldPool]:
+        """Sources of the worlds of ``sample``, for each purpose."""
+        return {"list": WorldPool(self, "list"), "training": WorldPool(self, "training")}
 
     # ---- who is in the line
 

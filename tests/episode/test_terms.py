@@ -121,8 +121,8 @@ def test_cost__of_all_steps_is_the_harm_that_the_reward_counts(reward: str, coun
     state, cost = game.reset(game.draw(20, 7, 0)), np.zeros(20)
     while not state.ended.all():
         state, step = game.step(state, np.full((20, 1), -0.2))
-        cost += arrays(game, state, step, 7, 2)["cost"]
-    infos = [arrays(game, state, step, 7, body) for body in (1, 2, 3)]
+        cost += arrays(game, state, step, 7, np.array([2]))["cost"]
+    infos = [arrays(game, state, step, 7, np.array([body])) for body in (1, 2, 3)]
     for name, harms in (("first_impact_harm", state.borne_harm("first")), ("total_harm", state.borne_harm("total"))):
         assert np.stack([info[name] for info in infos], axis=1) == near(harms)
     assert (

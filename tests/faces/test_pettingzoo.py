@@ -5,13 +5,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pettingzoo.utils.conversions import parallel_to_aec
 
 from ethbrake_marl.episode.full_state import full_state
-from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
+from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
 from ethbrake_marl.faces.shield import shield
 from tests.contract.interfaces import CRASH, PAPER, REST
 from tests.refused import refused
 
+ELEVEN = {
+    "name": "eleven",
+    "vehicles": 11,
+    "gaps_m": 7,
+    "speeds_mps": 20,
+    "braking_capacity_mps2": 6,
+    "driving_capacity_mps2": 3,
+    "mass_t": 1,
+    "latency_s": 0.5,
+    "restitution": 0,
+}
 SCRIPTED = PAPER.replace(roles={vehicle: "full_brake" for vehicle in PAPER.vehicle_names})
 
 
@@ -128,3 +140,26 @@ def test_a_line_without_learners__plays_by_itself() -> None:
     while env.agents:
         *_, infos = env.step({})
     assert infos["vehicle_1"]["time_s"] > 2.0
+
+
+@pytest.mark.parametrize("settings", [{}, {"scenario": ELEVEN}, {"agents": "learners"}], ids=str)
+def test_turns__are_those_of_pettingzoos_conversion(settings: dict[str, Any]) -> None:
+    ours, converted = raw_env(**settings), parallel_to_aec(EthBrakeParallelEnv(**settings))
+    assert str(ours) == str(converted)
+    for env in (ours, converted):
+        with pytest.raises(AttributeError, match="agent_selection cannot be accessed before reset"):
+            env.last()
+        env.reset(seed=7)
+    taken = 0
+    for agent in ours.agent_iter():
+        assert agent == converted.agent_selection and ours.agents == converted.agents
+        for name in ("rewards", "_cumulative_rewards", "terminations", "truncations", "infos"):
+            assert repr(getattr(ours, name)) == repr(getattr(converted, name))
+        observation, *values = ours.last()
+        expected, *expected_values = converted.last()
+        assert repr(values) == repr(expected_values) and np.array_equal(observation, expected)
+        action = None if values[1] or values[2] else [taken % 3 - 1.0]
+        ours.step(action)
+        converted.step(action)
+        taken += 1
+    assert taken > 20 and converted.agents == []

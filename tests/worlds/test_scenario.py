@@ -13,14 +13,15 @@ import pytest
 
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import NUMBER
-from ethbrake_marl.errors import AlreadyExists
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.yaml import read_yaml
-from ethbrake_marl.worlds import catalogue, explain
+from ethbrake_marl.worlds import catalogue, explain, sampling
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, load_scenario
 from ethbrake_marl.worlds.counters import uniform_numbers
 from ethbrake_marl.worlds.describe import clusters_of, columns_of, fixed_columns
-from ethbrake_marl.worlds.game import WorldPool, views_of
+from ethbrake_marl.worlds.game import views_of
 from ethbrake_marl.worlds.quantities import QUANTITIES
+from ethbrake_marl.worlds.sampling import WorldPool
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.fixtures.scenarios import SHIPPED
 from tests.refused import refused
@@ -249,10 +250,45 @@ def test_columns__are_all_that_was_drawn() -> None:
     assert fixed_columns(wet) < {*of_wet}
 
 
+def test_sample__one_world_after_the_other() -> None:
+    scenario = PAPER.replace(name="once")
+    for first in (0, 1, 2, 3, 2000, 2, 1024, 1025):
+        expected = bits(scenario.draw(1, 7, first=first).worlds)
+        for _ in range(2):
+            world = scenario.sample(1, 7, first=first)
+            assert bits(world) == expected
+            world.line[:] = 0.0  # the caller's own array
+    assert len(pickle.dumps(scenario)) < 100_000
+    assert pickle.loads(pickle.dumps(scenario)) == scenario == PAPER.replace(name="once")
+    with refused("seed of the list = 7.0: must be a whole number"):
+        scenario.sample(1, 7.0, first=2)  # type: ignore[arg-type]
+
+
+def test_sample__an_error_of_a_later_world_comes_only_with_that_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "MOST_ATTEMPTS", 2)  # with them, one world in 256 has an early impact
+    often = PAPER.replace(gaps_m=[{"choice": [0.01, 9.0], "weights": [1, 15]}, 9.0])
+    bad = next(k for k in range(999) if not can_draw(often, k))
+    assert 2 < bad < 900  # worlds before and after it are drawn together
+    fresh = often.replace(name="fresh")
+    for first in range(bad):
+        fresh.sample(1, 7, first=first)
+    with refused(f"early_impacts: reject, but in all 2 draws of world {bad} an impact happens"):
+        fresh.sample(1, 7, first=bad)
+
+
+def can_draw(scenario: Scenario, number: int) -> bool:
+    try:
+        scenario.draw(1, 7, first=number)
+    except InvalidInput:
+        return False
+    return True
+
+
 def test_game__has_the_training_worlds_and_sees_an_obstacle() -> None:
-    pool = WorldPool(PAPER)
-    for seed, first in ((0, 0), (0, 500), (1, 500), (1, 5000), (1, 10)):
-        assert bits(pool(3, seed, first)) == bits(PAPER.sample(3, seed, first=first, purpose="training"))
+    pool = WorldPool(PAPER, "training")
+    for seed, first in ((0, 0), (0, 3), (0, 500), (1, 500), (1, 503), (1, 5000), (1, 10), (1, 1520), (0, 6)):
+        expected = PAPER.draw(3, seed, first=first, purpose="training").worlds
+        assert bits(pool(3, seed, first)) == bits(expected)
     assert not any(name.startswith("obstacle") for name in views_of(line())[0].names)
     assert any(name.startswith("obstacle") for name in views_of(line(obstacle_gap_m=42))[0].names)
 
