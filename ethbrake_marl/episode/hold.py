@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, weights_of
+from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, pair_amount, weights_of
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacities
-from ethbrake_marl.motion.interval import FAILED, move_line
-from ethbrake_marl.motion.layout import BRAKING, Floats, Ints, scratch_for
+from ethbrake_marl.motion.interval import FAILED, STOPPED, move_line
+from ethbrake_marl.motion.layout import BRAKING, FIRST, NEW_FIRST, NEW_TOTAL, TOTAL, Floats, Ints, scratch_for
 
 
 @large
@@ -30,16 +30,35 @@ def hold_worlds(inputs, weights, tie_weights, out):
     line, car, wanted, bodies, trials, time, until, memory = inputs
     for k in range(trials.shape[0]):
         for j in range(trials.shape[1]):
-            failed = hold_world(line[k], car[k], wanted[k], bodies, trials[k, j], time[k], until[k], memory)
+            failed = hold_world(
+                line[k], car[k], wanted[k], bodies, trials[k, j], time[k], until[k], memory, (weights, math.inf)
+            )
             out[0, k, j] = math.inf if failed else amount_so_far(memory[1], weights)
             out[1, k, j] = math.inf if failed else amount_so_far(memory[1], tie_weights)
 
 
 @kernel
-def hold_world(line, car, wanted, bodies, trial, time, until, memory):
+def exceeds(line, scratch, limit):
+    """Whether the harm so far, within an interval, is above a limit; ``limit``: the count's weights [6], and m2/s2.
+
+    The sum has the order of ``amount_so_far``, and no summand ever falls: so the harm at the end is above the limit,
+    too, also after rounding.
+    """
+    (weights, most), amount = limit, 0.0
+    for p in range(line.shape[1] - 1):
+        first, total = line[FIRST, p], line[TOTAL, p]
+        line[FIRST, p], line[TOTAL, p] = first + scratch[NEW_FIRST, p], total + scratch[NEW_TOTAL, p]
+        amount += pair_amount(line, p, weights)
+        line[FIRST, p], line[TOTAL, p] = first, total
+    return amount > most
+
+
+@kernel
+def hold_world(line, car, wanted, bodies, trial, time, until, memory, limit):
     """Write the line at ``until`` to ``memory`` if ``bodies`` hold the commands ``trial`` [B] (m/s2), in one world.
 
-    Returns whether a check of the physics failed. Arguments: a row of ``kernel_inputs``.
+    Returns whether the harm exceeds the ``limit`` (``exceeds``), or a check of the physics failed. Other arguments: a
+    row of ``kernel_inputs``.
     """
     scratch, line_copy, commands = memory
     for row in range(line_copy.shape[0]):
@@ -49,9 +68,9 @@ def hold_world(line, car, wanted, bodies, trial, time, until, memory):
         commands[i] = wanted[i]
     for b in range(len(bodies)):
         commands[bodies[b]] = trial[b]
-    failed = move_line(line_copy, car, commands, scratch, time, until) == FAILED
+    outcome = move_line(line_copy, car, commands, scratch, time, until, exceeds, limit)
     note_motion(line_copy)
-    return failed
+    return outcome in (FAILED, STOPPED)
 
 
 @kernel
@@ -90,10 +109,11 @@ def choose_worlds(inputs, weights, best, least):
             for row in states:
                 if largest >= least[k]:
                     break
-                failed = hold_world(
-                    line[row], car[row], wanted[row], bodies, trials[row, j], time[row], until[row], memory
+                limit = weights, least[k]
+                worse = hold_world(
+                    line[row], car[row], wanted[row], bodies, trials[row, j], time[row], until[row], memory, limit
                 )
-                largest = max(largest, math.inf if failed else amount_so_far(memory[1], weights))
+                largest = max(largest, math.inf if worse else amount_so_far(memory[1], weights))
             if largest < least[k]:
                 best[k], least[k] = j, largest
 
