@@ -75,7 +75,7 @@ def proposal_array(learners: Ints, actions: Floats | None, n: int) -> Floats:
     actions = action_array(learners, actions, n)
     for row in actions[(np.abs(actions) > LARGEST_ACTION).any(axis=1)]:
         check_actions(learners, np.where(np.isnan(row), 0.0, row))
-    return np.clip(actions, -1.0, 1.0)
+    return np.minimum(np.maximum(actions, -1.0), 1.0)
 
 
 def check_actions(learners: Ints, actions: Floats) -> None:

@@ -7,41 +7,115 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, weights_of
+from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, pair_amount, weights_of
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import note_motion
-from ethbrake_marl.motion.compiling import large
+from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacities
-from ethbrake_marl.motion.interval import FAILED, move_line
-from ethbrake_marl.motion.layout import BRAKING, Floats, scratch_for
+from ethbrake_marl.motion.interval import FAILED, STOPPED, move_line
+from ethbrake_marl.motion.layout import BRAKING, FIRST, NEW_FIRST, NEW_TOTAL, TOTAL, Floats, Ints, scratch_for
 
 
 @large
-def hold_worlds(line, car, wanted, bodies, trials, time, until, weights, tie_weights, memory, out):
-    """Write the harm (m2/s2) to ``out`` [2, n, C] if ``bodies`` [B] hold the commands ``trials`` [n, C, B] (m/s2).
+def hold_worlds(inputs, weights, tie_weights, out):
+    """Write the harm (m2/s2) of the trials to ``out`` [2, n, C].
 
-    Each of C trials starts from ``line``; all other bodies hold ``wanted``. Row 0 of ``out`` is the harm in the count
-    with the weights ``weights`` [6], row 1 in the count with ``tie_weights`` [6]. The commands hold from ``time`` to
-    ``until`` (s, [n] each). ``line``, ``car`` and ``wanted`` are arrays of a ``State``. ``memory`` is working memory:
-    scratch of the physics, one line, and the commands of this line.
+    Row 0 is the harm in the count with the weights ``weights`` [6], row 1 in the count with ``tie_weights`` [6].
+    ``inputs``: ``kernel_inputs``.
+    """
+    line, car, wanted, bodies, trials, time, until, memory = inputs
+    for k in range(trials.shape[0]):
+        for j in range(trials.shape[1]):
+            failed = hold_world(
+                line[k], car[k], wanted[k], bodies, trials[k, j], time[k], until[k], memory, (weights, math.inf)
+            )
+            out[0, k, j] = math.inf if failed else amount_so_far(memory[1], weights)
+            out[1, k, j] = math.inf if failed else amount_so_far(memory[1], tie_weights)
+
+
+@kernel
+def exceeds(line, scratch, limit):
+    """Whether the harm so far, within an interval, is above a limit; ``limit``: the count's weights [6], and m2/s2.
+
+    The sum has the order of ``amount_so_far``, and no summand ever falls: so the harm at the end is above the limit,
+    too, also after rounding.
+    """
+    (weights, most), amount = limit, 0.0
+    for p in range(line.shape[1] - 1):
+        first, total = line[FIRST, p], line[TOTAL, p]
+        line[FIRST, p], line[TOTAL, p] = first + scratch[NEW_FIRST, p], total + scratch[NEW_TOTAL, p]
+        amount += pair_amount(line, p, weights)
+        line[FIRST, p], line[TOTAL, p] = first, total
+    return amount > most
+
+
+@kernel
+def hold_world(line, car, wanted, bodies, trial, time, until, memory, limit):
+    """Write the line at ``until`` to ``memory`` if ``bodies`` hold the commands ``trial`` [B] (m/s2), in one world.
+
+    Returns whether the harm exceeds the ``limit`` (``exceeds``), or a check of the physics failed. Other arguments: a
+    row of ``kernel_inputs``.
     """
     scratch, line_copy, commands = memory
-    for k in range(trials.shape[0]):
+    for row in range(line_copy.shape[0]):
         for i in range(len(commands)):
-            commands[i] = wanted[k, i]
+            line_copy[row, i] = line[row, i]
+    for i in range(len(commands)):
+        commands[i] = wanted[i]
+    for b in range(len(bodies)):
+        commands[bodies[b]] = trial[b]
+    outcome = move_line(line_copy, car, commands, scratch, time, until, exceeds, limit)
+    note_motion(line_copy)
+    return outcome in (FAILED, STOPPED)
+
+
+@kernel
+def repeats(trials, j):
+    """Whether the trial ``j`` equals an earlier one; ``trials`` [M, C, B] belong to the M states of one world."""
+    for earlier in range(j):
+        same = True
+        for m in range(trials.shape[0]):
+            for b in range(trials.shape[2]):
+                same = same and trials[m, earlier, b] == trials[m, j, b]
+        if same:
+            return True
+    return False
+
+
+@large
+def choose_worlds(inputs, weights, best, least):
+    """Write the number of the best trial to ``best`` [n], and its harm (m2/s2) to ``least`` [n].
+
+    Before, ``least`` is the harm that a trial must stay below. ``inputs`` (``kernel_inputs``) have a row for each of
+    the M possible states of a world. Harm never falls, so the search ends once ``least`` is the harm so far, and what
+    can only be worse is not simulated.
+    """
+    line, car, wanted, bodies, trials, time, until, memory = inputs
+    M = len(line) // len(least)
+    for k in range(len(least)):
+        states, so_far = range(k * M, (k + 1) * M), 0.0
+        for row in states:
+            so_far = max(so_far, amount_so_far(line[row], weights))
         for j in range(trials.shape[1]):
-            for row in range(line_copy.shape[0]):
-                for i in range(len(commands)):
-                    line_copy[row, i] = line[k, row, i]
-            for b in range(len(bodies)):
-                commands[bodies[b]] = trials[k, j, b]
-            failed = move_line(line_copy, car[k], commands, scratch, time[k], until[k]) == FAILED
-            note_motion(line_copy)
-            out[0, k, j] = math.inf if failed else amount_so_far(line_copy, weights)
-            out[1, k, j] = math.inf if failed else amount_so_far(line_copy, tie_weights)
+            if least[k] <= so_far:
+                break
+            if repeats(trials[k * M : (k + 1) * M], j):
+                continue
+            largest = 0.0
+            for row in states:
+                if largest >= least[k]:
+                    break
+                limit = weights, least[k]
+                worse = hold_world(
+                    line[row], car[row], wanted[row], bodies, trials[row, j], time[row], until[row], memory, limit
+                )
+                largest = max(largest, math.inf if worse else amount_so_far(memory[1], weights))
+            if largest < least[k]:
+                best[k], least[k] = j, largest
 
 
 def hold(
@@ -52,15 +126,46 @@ def hold(
     The first row is the harm in ``count``, the second the harm in the count that breaks ties. ``trials`` [n, C, B] are
     C sets of commands for the B bodies (m/s2); all other bodies hold ``wanted`` [n, N + 1] (m/s2).
     """
+    out, weights = np.empty((2, *trials.shape[:2])), (weights_of(count), weights_of(other_count(count)))
+    hold_worlds(kernel_inputs(state, wanted, bodies, trials, until_s), *weights, out)
+    return out
+
+
+def choose(
+    state: State,
+    wanted: Floats,
+    bodies: Sequence[int] | Ints,
+    trials: Floats,
+    until_s: float | Floats,
+    count: Count,
+    below: Floats,
+) -> tuple[Ints, Floats]:
+    """Number of the first trial with the least harm, [n], and this harm, [n] m2/s2.
+
+    Only harm under ``below`` [n] (m2/s2) counts; where there is none, the results are 0 and ``below``. Other arguments
+    as in ``hold``, but ``state`` may contain M possible states of each world, in consecutive rows; then the largest
+    harm over these states counts.
+    """
+    best, least = np.zeros(len(below), np.int64), below.copy()
+    choose_worlds(kernel_inputs(state, wanted, bodies, trials, until_s), weights_of(count), best, least)
+    return best, least
+
+
+def kernel_inputs(
+    state: State, wanted: Floats, bodies: Sequence[int] | Ints, trials: Floats, until_s: float | Floats
+) -> tuple[Any, ...]:
+    """Trials as the kernels need them. Raises ``InvalidInput`` for worlds of another physics.
+
+    Each of C trials starts from ``line``: ``bodies`` [B] hold the commands ``trials`` [n, C, B] (m/s2), all others hold
+    ``wanted``, from ``time`` to ``until`` (s, [n] each). ``line``, ``car`` and ``wanted`` are arrays of a ``State``.
+    ``memory`` is working memory: scratch of the physics, one line, and the commands of this line.
+    """
     features = "e_v2x_bm other than pairwise, shields other than episode:pairwise, shaping"
     check_exact(state, f"a plan of constant commands ({features})")
-    out, weights = np.empty((2, *trials.shape[:2])), (weights_of(count), weights_of(other_count(count)))
+    until, bodies = np.full(state.n, until_s, np.float64), np.asarray(bodies, np.int64)
     memory = scratch_for(wanted.shape[1]), np.zeros(state.line.shape[1:]), np.zeros(wanted.shape[1])
-    hold_worlds(
-        state.line, state.car, wanted, np.asarray(bodies, np.int64), np.ascontiguousarray(trials),
-        state.time_s.copy(), np.full(state.n, until_s, np.float64), *weights, memory, out,
-    )  # fmt: skip
-    return out
+    time, trials = state.time_s.copy(), np.ascontiguousarray(trials)
+    return state.line, state.car, wanted, bodies, trials, time, until, memory
 
 
 def descend(
@@ -76,7 +181,8 @@ def descend(
     commands, least = -braking, np.zeros(state.n)
     for body in list(bodies) * rounds:
         trials = -braking[:, [body]] * shares
-        harm = hold(state, commands, [body], trials[:, :, np.newaxis], until_s, count)[0]
-        commands[:, body] = np.take_along_axis(trials, harm.argmin(axis=1)[:, np.newaxis], 1)[:, 0]
-        least = harm.min(axis=1)
+        best, least = choose(
+            state, commands, [body], trials[:, :, np.newaxis], until_s, count, np.full(state.n, np.inf)
+        )
+        commands[:, body] = trials[np.arange(state.n), best]
     return commands, least

@@ -169,11 +169,12 @@ def potential(settings: StepSettings, state: State) -> Floats:
     ended is 0.
     """
     learners = settings.learners.tolist()
-    rounds = 1 if len(learners) == 1 else 2
+    # With one learner only the least harm counts: full braking comes first, which often does no more harm.
+    shares, rounds = (BRAKING_SHARES[::-1], 1) if len(learners) == 1 else (BRAKING_SHARES, 2)
     line = state.line.copy()
     line[:, COUNTED_ROWS] = 0.0
     state = state._replace(line=line)
-    _, least = descend(state, learners, BRAKING_SHARES, rounds, state.clock[:, END], settings.weights)
+    _, least = descend(state, learners, shares, rounds, state.clock[:, END], settings.weights)
     least[state.ended] = 0.0
     return -least
 

@@ -61,6 +61,7 @@ from ethbrake_marl.motion.push import add_push
 NO_CONTACT = 0  # no two bodies could touch
 EVENT_BY_EVENT = 1  # went from event to event; if nothing touched, what contacts changed is 0
 FAILED = 2  # a check of the physics failed: never the user's fault
+STOPPED = 3  # stopped after an impact, because `exceeds` was true
 
 MISSED_M = 1e-9  # a gap below minus this means that a contact was missed
 MOST_EVENTS = 1_000_000  # more events of an interval mean a defect (the most ever seen: 160,000)
@@ -285,7 +286,7 @@ def move_apart(line, car, scratch, duration, ahead, builds):
 
 
 @kernel
-def through_interval(line, car, scratch, start, until, ahead, builds):
+def through_interval(line, car, scratch, start, until, ahead, builds, exceeds, limit):
     """Move one line as ``move_line`` does: at once if no two bodies touch, otherwise from event to event.
 
     ``builds`` must be the constant True or False (module docstring).
@@ -308,6 +309,9 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
         outcome = FAILED
         for _ in range(MOST_EVENTS):
             if resolve_impacts(line, car, scratch, now, ahead):
+                if exceeds is not None and exceeds(line, scratch, limit):
+                    outcome = STOPPED
+                    break
                 continue
             if now >= duration:
                 outcome = EVENT_BY_EVENT
@@ -334,9 +338,9 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
 
 
 @shared
-def through_interval_building(line, car, scratch, start, until, ahead):
+def through_interval_building(line, car, scratch, start, until, ahead, exceeds, limit):
     """``through_interval`` for a line in which some force follows its command at a finite rate."""
-    return through_interval(line, car, scratch, start, until, ahead, True)
+    return through_interval(line, car, scratch, start, until, ahead, True, exceeds, limit)
 
 
 @kernel
@@ -355,13 +359,14 @@ def note_driving(line, car, wanted, start, until):
 
 
 @kernel
-def move_line(line, car, wanted, scratch, start, until):
+def move_line(line, car, wanted, scratch, start, until, exceeds=None, limit=None):
     """Move one line from ``start`` to ``until`` (s after the alert) under the commands ``wanted`` [N + 1] (m/s2).
 
     A command has no effect before the body's latency has elapsed. Changes ``line``; returns ``NO_CONTACT``,
     ``EVENT_BY_EVENT`` or ``FAILED``. Unless the result is ``NO_CONTACT``, ``scratch`` then holds the harm of this
     interval (rows NEW), the first impact of each pair (rows NEXT) and the largest changes of speed by an impact (rows
-    CHANGE).
+    CHANGE). If the kernel ``exceeds(line, scratch, limit)`` is true after an impact, the line stops there, and the
+    result is ``STOPPED``; None never stops it, and the compiler drops the question.
     """
     ahead, builds = 0 if line[GAP, 0] < FAR_M else 1, False
     for i in range(line.shape[1]):
@@ -370,8 +375,8 @@ def move_line(line, car, wanted, scratch, start, until):
     scratch[NEW_FIRST, 0] = scratch[NEW_TOTAL, 0] = scratch[NEW_IMPACTS, 0] = 0.0
     note_driving(line, car, wanted, start, until)
     if builds:
-        return through_interval_building(line, car, scratch, start, until, ahead)
-    return through_interval(line, car, scratch, start, until, ahead, False)
+        return through_interval_building(line, car, scratch, start, until, ahead, exceeds, limit)
+    return through_interval(line, car, scratch, start, until, ahead, False, exceeds, limit)
 
 
 @kernel

@@ -15,9 +15,11 @@ from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.team import Agent, propose
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.hold import descend, hold
-from ethbrake_marl.episode.state import END, State
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.episode.hold import choose, descend
+from ethbrake_marl.episode.state import END, STEPS, TIME, State
+from ethbrake_marl.motion.compiling import large
+from ethbrake_marl.motion.forces import capacity
+from ethbrake_marl.motion.layout import BRAKING, Floats
 
 BRAKE_SHARES = np.linspace(0.0, 1.0, 21)  # shares of its brakes that each of several learners tries at the alert
 FALLBACK_ROUNDS = 2  # rounds in which the learners take turns to try them
@@ -51,27 +53,42 @@ def constant_plans(game: Game, actions: Floats) -> Floats:
     return np.repeat(actions[:, np.newaxis], decisions, axis=1)
 
 
-def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
+def best_constant(game: Game, states: State, plans: Floats, count: str, below: Floats) -> tuple[Floats, Floats]:
     """Constant actions with the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
 
     A candidate is the next actions of ``plans`` [n, T, L] with one of ``CHANGES`` added to all of them. With several
     learners there are more candidates: one learner holds one of ``SINGLE_ACTIONS``, the others hold the plan's next
     actions. ``states`` may contain several possible states of each world, in consecutive rows; then the largest harm
-    over these states counts.
+    over these states counts. Where no candidate has an estimate under ``below`` [n] (m2/s2), the estimate is ``below``.
     """
-    learners, rows, states_per_world = game.settings.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
-    planned = plans[rows, np.minimum(states.steps[::states_per_world], plans.shape[1] - 1)]
-    actions = np.minimum(np.maximum(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0), 0.0)
-    if len(learners) > 1:
-        alone = np.repeat(planned[:, np.newaxis], len(learners) * len(SINGLE_ACTIONS), axis=1)
-        for column in range(len(learners)):
-            alone[:, column * len(SINGLE_ACTIONS) : (column + 1) * len(SINGLE_ACTIONS), column] = SINGLE_ACTIONS
-        actions = np.concatenate([actions, alone], axis=1)
-    commands = actions.repeat(states_per_world, axis=0) * states.braking_capacity_mps2[:, np.newaxis, learners - 1]
-    harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], count)[0]
-    harm = harm.reshape(len(plans), states_per_world, -1).max(axis=1)
-    best = harm.argmin(axis=1)
-    return actions[rows, best, np.newaxis], harm[rows, best]
+    learners, (n, _, L) = game.settings.learners, plans.shape
+    single_actions = SINGLE_ACTIONS if L > 1 else SINGLE_ACTIONS[:0]
+    actions = np.empty((n, len(CHANGES) + L * len(single_actions), L))
+    commands = np.empty((states.n, *actions.shape[1:]))
+    write_candidates(states.car, states.clock, learners, plans, CHANGES, single_actions, actions, commands)
+    best, least = choose(states, states.wanted, learners, commands, states.clock[:, END], count, below)
+    return actions[np.arange(n), best, np.newaxis], least
+
+
+@large
+def write_candidates(car, clock, learners, plans, changes, single_actions, actions, commands):
+    """Write the candidates of ``best_constant`` to ``actions`` [n, C, L], and their commands (m/s2) to ``commands``.
+
+    ``commands`` [n M, C, L], ``car`` and ``clock`` have a row for each of the M possible states of a world.
+    """
+    M = len(car) // len(plans)
+    for row in range(len(car)):
+        k = row // M
+        now = min(int(clock[k * M, STEPS]), plans.shape[1] - 1)
+        for j in range(actions.shape[1]):
+            for c in range(len(learners)):
+                action, single = plans[k, now, c], j - len(changes) - c * len(single_actions)
+                if j < len(changes):
+                    action = min(max(action + changes[j], -1.0), 0.0)
+                elif 0 <= single < len(single_actions):
+                    action = single_actions[single]
+                actions[k, j, c] = action
+                commands[row, j, c] = action * capacity(car[row], BRAKING, learners[c], clock[row, TIME])
 
 
 def rollout(

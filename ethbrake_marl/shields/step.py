@@ -47,6 +47,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
+from ethbrake_marl.shields.proposals import compare, follow_plan, note_trial
 from ethbrake_marl.shields.shield import NamedShield, ShieldReason, check_drivers, checked_drivers, spread
 
 NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
@@ -56,6 +57,7 @@ NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, be
 NO_DECISION, SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED, POLICY_ROLLOUT = map(
     int, ShieldReason
 )
+COMPARISONS = SAME_AS_PLAN, NO_CERTIFICATE, NOT_A_NUMBER, ENDED  # reasons before any trial
 
 
 class StepShieldMemory(NamedTuple):
@@ -77,9 +79,9 @@ class StepShieldMemory(NamedTuple):
 
 
 # A way to continue after an action: its `ShieldReason`, and a function (shield, game, states after the action, plans,
-# most) -> actions at every decision, [n, T or 1, L], and an estimate of their harm, [n], never too high (0: unknown).
-# Actions with an estimate above `most` are not priced.
-Fallback = tuple[int, Callable[["StepShield", Game, State, Floats, Floats], tuple[Floats, Floats]]]
+# most, below) -> actions at every decision, [n, T or 1, L], and an estimate of their harm, [n], never too high (0:
+# unknown). Actions with an estimate above `most` are not priced; an estimate of `below` or more has no effect.
+Fallback = tuple[int, Callable[["StepShield", Game, State, Floats, Floats, Floats], tuple[Floats, Floats]]]
 
 
 class StepShield:
@@ -190,35 +192,32 @@ class StepShield:
         proposed, state = self.collect_proposals(game, state, proposed)
         if not donate:
             memory = memory._replace(plan=memory.plan.copy(), price=memory.price.copy())
-        worlds, now = np.arange(state.n), np.minimum(state.steps, memory.plan.shape[1] - 1)
-        planned, silent, bound = memory.plan[worlds, now], np.isnan(proposed), self.bound(memory)
-        candidates, running = np.where(silent, planned, proposed), ~state.ended[:, np.newaxis]
-        deviates = (candidates != planned) & running
-        reason = np.where(deviates, NO_CERTIFICATE, np.where(silent, NOT_A_NUMBER, SAME_AS_PLAN))
-        margin = np.repeat((bound - memory.price)[:, np.newaxis], proposed.shape[1], axis=1)
+        bound, now, ended, shape = self.bound(memory), state.steps, state.ended, proposed.shape
+        candidates, margin, reason = np.empty(shape), np.empty(shape), np.empty(shape, np.int64)
+        compare(ended, now, memory.plan, proposed, bound - memory.price, COMPARISONS, candidates, margin, reason)
+        deviates = reason == NO_CERTIFICATE
         rejected = deviates.any(axis=1).nonzero()[0]
-        for columns in trials(proposed.shape[1]):
+        for number, columns in enumerate(trials(shape[1])):
             if not len(rejected):
                 break
-            trial_mask, rejected_actions, together = deviates[rejected] & columns, candidates[rejected], columns.all()
-            actions = np.where(trial_mask, rejected_actions, memory.plan[rejected, now[rejected]])
-            new = trial_mask.any(axis=1)
-            if not together:
-                new &= (actions != rejected_actions).any(axis=1)  # what was rejected together is not tried again
-            rows, trial_mask = rejected[new], trial_mask[new]
+            rows, trial_mask, actions = rejected, deviates[rejected] & columns, candidates[rejected]
+            if number:
+                actions = np.where(trial_mask, actions, memory.plan[rows, now[rows]])
+                # what was rejected together is not tried again
+                new = trial_mask.any(axis=1) & (actions != candidates[rows]).any(axis=1)
+                rows, trial_mask, actions = rows[new], trial_mask[new], actions[new]
             if len(rows):
-                rests = self.rests if together else self.rests[:1]  # what the agents propose, they propose together
-                why, least = self.accept(game, state, memory, rows, actions[new], now[rows], rests)
-                reason[rows] = np.where(trial_mask, why[:, np.newaxis], reason[rows])
-                margin[rows] = np.where(trial_mask, (bound[rows] - least)[:, np.newaxis], margin[rows])
-                if together:
+                rests = self.rests[:1] if number else self.rests  # what the agents propose, they propose together
+                why, least = self.accept(game, state, memory, rows, actions, now[rows], rests)
+                note_trial(rows, trial_mask, why, bound[rows] - least, reason, margin)
+                if number == 0:
                     rejected = rows[why == NO_CERTIFICATE]
-        applied = memory.plan[worlds, now]
-        differ = (applied != proposed) & running
+        applied, replaced = np.empty(shape), memory.replaced.copy()
+        intervened = np.zeros((state.n, state.vehicles), np.bool_)
+        follow_plan(ended, now, memory.plan, proposed, game.settings.learners, applied, intervened, replaced)
         return applied, memory._replace(
             agents=tuple(state.memories[body] for body in self.drivers), proposed=proposed, applied=applied,
-            intervened=spread(game, state, differ, False), replaced=memory.replaced + differ.sum(axis=1),
-            reason=np.where(running, reason, ENDED), margin=margin,
+            intervened=intervened, replaced=replaced, reason=reason, margin=margin,
         )  # fmt: skip
 
     def collect_proposals(self, game: Game, state: State, proposed: Floats | None) -> tuple[Floats, State]:
@@ -270,7 +269,9 @@ class StepShield:
                 break
             here = take_worlds(before, open_rows, M)
             after, _ = game.follow(here, actions[open_rows].repeat(M, axis=0))
-            later, value = rest(self, game, after, plans[open_rows], most[open_rows])
+            # No estimate that is priced or that lowers `least` is above `below`, because `least` is above `most`.
+            below = least[open_rows] + 2.0 * NEARLY
+            later, value = rest(self, game, after, plans[open_rows], most[open_rows], below)
             # Only plans that the estimate does not rule out are priced.
             hopeful = (value <= most[open_rows] + NEARLY).nonzero()[0]
             if len(hopeful):
@@ -319,16 +320,22 @@ def trials(learners: int) -> Bools:
     return alone if learners == 1 else np.concatenate([alone.any(axis=0, keepdims=True), alone])
 
 
-def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
+def constant(
+    shield: StepShield, game: Game, after: State, plans: Floats, most: Floats, below: Floats
+) -> tuple[Floats, Floats]:
     """Fallback of ``accept``: plans that continue with the best constant actions, and an estimate of their harm.
 
     The estimate is 0 (unknown) if scripts look at the state.
     """
-    plans, estimate = best_constant(game, after, plans, shield.count)
-    return plans, np.zeros(len(plans)) if game.scripts else estimate
+    if not game.scripts:
+        return best_constant(game, after, plans, shield.count, below)
+    plans, _ = best_constant(game, after, plans, shield.count, np.full(len(plans), np.inf))
+    return plans, np.zeros(len(plans))
 
 
-def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
+def agents_drive(
+    shield: StepShield, game: Game, after: State, plans: Floats, most: Floats, below: Floats
+) -> tuple[Floats, Floats]:
     """Fallback of ``accept``: plans in which the shield's agents drive from the states ``after`` on.
 
     The second result, an estimate of the plans' harm, is 0 (unknown).

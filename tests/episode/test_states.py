@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.hold import descend, hold
+from ethbrake_marl.episode.hold import choose, descend, hold
 from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.script_calls import guard_scripts
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
 from ethbrake_marl.names import open_game
@@ -137,6 +137,30 @@ def test_hold__is_the_harm_of_constant_commands() -> None:
         while not now.ended.all():
             now, _ = game.step(now, np.full((N, 1), share))
         np.testing.assert_allclose(found[:, :, c], [now.harm("total"), now.harm("first")], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", ["first", "honest"])
+@pytest.mark.parametrize(
+    "name", ["paper-random", "paper-random-obstacle", "paper-random-buildup", "cooperation-3-five"]
+)
+@pytest.mark.parametrize("states", [1, 5])  # possible states of each world
+def test_choose__is_the_first_trial_with_the_least_harm(name: str, count: str, states: int) -> None:
+    scenario, game = open_game(name)
+    state, rng, bodies = game.reset(scenario.sample(60, 3)), np.random.default_rng(1), [2, 3]
+    for _ in range(5):
+        state, _ = game.step(state, np.full((60, len(game.settings.learners)), -0.2))
+    n, shares = (
+        60 // states,
+        rng.uniform(0.0, 1.0, (60, 10, 2))[:, [0, 1, 0, *range(2, 10)]],
+    )  # the third repeats the first
+    trials = -state.car[:, np.newaxis, BRAKING, bodies] * shares
+    harm = hold(state, state.wanted, bodies, trials, state.clock[:, END], count)[0].reshape(n, states, -1).max(axis=1)
+    for below in (np.full(n, np.inf), harm.min(axis=1), harm[:, 3], harm[:, 3] + 1e-9):
+        best, least = choose(state, state.wanted, bodies, trials, state.clock[:, END], count, below)
+        expected = np.where(harm < below[:, np.newaxis], harm, below[:, np.newaxis])
+        assert least.tolist() == expected.min(axis=1).tolist()
+        assert best.tolist() == np.where(harm.min(axis=1) < below, harm.argmin(axis=1), 0).tolist()
+    assert len({*harm.argmin(axis=1).tolist()}) > 1
 
 
 def test_descend__returns_the_commands_whose_harm_it_tells() -> None:

@@ -11,15 +11,16 @@ from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.play import follow_plans, price
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
 from ethbrake_marl.names import make_agent, open_game
 from ethbrake_marl.policies.bundle import load_shipped
-from ethbrake_marl.shields.fallbacks import first_plans
+from ethbrake_marl.shields.fallbacks import CHANGES, SINGLE_ACTIONS, best_constant, first_plans
 from ethbrake_marl.shields.shield import ShieldReason
-from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.shields.step import StepShield, constant
 from ethbrake_marl.worlds.user_worlds import worlds_from_state
 from tests.shields.attack import LINES, WAYS
 
@@ -289,6 +290,33 @@ def test_a_script_that_reacts_is_asked_in_every_play() -> None:
     deaf, _ = follow_plans(game._replace(scripts={}), state, plan, "first")
     heard, harm = follow_plans(game, state, plan, "first")
     assert (heard.harm() == harm).all() and (deaf.harm() != harm).any()
+
+
+def test_with_such_a_script_the_best_constant_actions_are_tried_whatever_their_estimate() -> None:
+    game, state = opened("follower", 40)
+    shield, plans = game.shield, state.memories["shield"].plan
+    tried, estimate = constant(shield, game, state, plans, np.zeros(40), np.full(40, np.inf))
+    again, unknown = constant(shield, game, state, plans, np.zeros(40), np.full(40, -1.0))
+    assert (again == tried).all() and not estimate.any() and not unknown.any()
+
+
+@pytest.mark.parametrize("name", ["paper", "pair", "all"])
+def test_constant_actions_have_the_least_harm_of_all_candidates(name: str) -> None:
+    game, state = opened(name, 30)
+    learners, rng, unbounded = game.settings.learners, np.random.default_rng(3), np.full(30, np.inf)
+    plans, L = rng.uniform(-1.0, 0.2, (30, 4, len(learners))), len(learners)
+    state, _ = game.follow(state, plans[:, 0])
+    planned = plans[:, [1]]
+    candidates = [np.clip(planned + change, -1.0, 0.0) for change in CHANGES]
+    for c in range(L if L > 1 else 0):
+        for action in SINGLE_ACTIONS:
+            candidates.append(planned.copy())
+            candidates[-1][:, 0, c] = action
+    commands = np.concatenate(candidates, axis=1) * state.braking_capacity_mps2[:, np.newaxis, learners - 1]
+    harm = hold(state, state.wanted, learners, commands, state.clock[:, END], "first")[0]
+    actions, least = best_constant(game, state, plans, "first", unbounded)
+    assert least.tolist() == harm.min(axis=1).tolist()
+    assert (actions == np.stack(candidates)[harm.argmin(axis=1), np.arange(30)]).all()
 
 
 # ------------------------------------------------------------------------------------------------ refusals
