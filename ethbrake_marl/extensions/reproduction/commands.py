@@ -24,10 +24,12 @@ def reproduce_command(
             show_default="everything",
         ),
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Use shipped policies; train only one that has not converged (default).")
+    full: Annotated[
+        bool,
+        typer.Option(
+            "--full", help="Also train by the paper's own process, which takes hours; --cost prints how many."
+        ),
     ] = False,
-    full: Annotated[bool, typer.Option("--full", help="Also train by the paper's own process.")] = False,
     policies: Annotated[
         str, typer.Option(metavar="NAME=AGENT,...", help="Agents in place of the shipped policies: ppo=policy@RUN.")
     ] = "",
@@ -45,18 +47,16 @@ def reproduce_command(
 ) -> None:
     """Reproduce the paper's results, and compare ours with them.
 
-    The command prints how long the work takes, and then one table: each number and statement of the paper, ours, and
-    why they differ. It writes a page (README.md) with this table and all items, and figures (SVG, PDF) and tables (CSV,
-    LaTeX) of each. An item is a figure or a table of the paper. After an interruption, repeat the command: trainings go
-    on where they were.
+    The command prints how long the work takes, and then one table: each number and statement of the paper, ours, our
+    verdict and a reason. Shipped policies drive; only a policy that has not converged is trained. It writes a page
+    (README.md) with this table and all items, and figures (SVG, PDF) and tables (CSV, LaTeX) of each. An item is a
+    figure or a table of the paper. After an interruption, repeat the command: trainings go on where they were.
     """
     with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_REPRODUCTION) as out:
         from ethbrake_marl.extensions.reproduction import items
         from ethbrake_marl.extensions.reproduction.made import ReproductionSettings
         from ethbrake_marl.extensions.studies.machine import this_machine
 
-        if quick and full:
-            raise InvalidInput("--quick and --full cannot be combined; give only one of them")
         chosen = items.choose_items(names or ())
         if list_only:
             rows = [(item.name, ", ".join(item.labels), item.title) for item in chosen]
@@ -70,7 +70,7 @@ def reproduce_command(
         results = items.reproduce(settings, chosen, this_machine(), force=out.force)
         if results is None:
             out.interrupted(f"interrupted; {AFTER_STOPPED_REPRODUCTION}")
-        out.result(items.plain_results(results), items.overview(results), in_file=True)
+        out.result(items.plain_results(results, settings), items.overview(results, settings), in_file=True)
         if not full:
             out.note(items.QUICK_NOTE)
         out.note(f"page: {output / items.RESULTS_FILE}")
@@ -101,4 +101,4 @@ def chosen_policies(text: str) -> dict[str, str]:
     return {**SHIPPED_SPECS, **replaced}
 
 
-REPRODUCE = Part(reproduce_command, epilog=example("reproduce random-table harm-distance --quick --output runs/paper"))
+REPRODUCE = Part(reproduce_command, epilog=example("reproduce random-table harm-distance --output runs/paper"))

@@ -2,8 +2,8 @@
 
 The process uses the recipes ``ppo-paper`` and ``sac-paper`` in the paper's fixed-step map (``physics: paper-map``):
 five seeds in the random test, and three each at a high and a low delay (``fig:ppo_sac_high_latency``,
-``fig:ppo_sac_low_latency``). For the paper's policy that has not converged, a PPO training with our recipe is stopped
-early.
+``fig:ppo_sac_low_latency``); one PPO training at the low delay has no terminal reward. For the paper's policy that has
+not converged, a PPO training with our recipe is stopped early.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import curve_over_seeds, curves_figure
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
-from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge
+from ethbrake_marl.extensions.reproduction.verdicts import VERDICT_TOLERANCE, Claim, Less, judge
 from ethbrake_marl.files.plain import read_object
-from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.motion.layout import Floats
 
-RANDOM, HIGH, LOW, STOPPED = "random", "high", "low", "stopped"
+RANDOM, HIGH, LOW, STOPPED, DENSE = "random", "high", "low", "stopped", "dense"
 STATUS = "run.json"  # file with the status of a run
+SECONDS = "cpu_s.txt"  # file with the processor time of a finished training
 
 
 class TrainingPlan(NamedTuple):
@@ -36,19 +37,22 @@ class TrainingPlan(NamedTuple):
     seconds: float  # processor time of the training of one seed, for estimates
     decisions: int | None = None  # None: those of the recipe
     mapped: bool = True  # in the paper's map
+    terminal: float | None = None  # reward at an end without a collision; None: that of the recipe
 
 
-def _process(scenario: str, seeds: int) -> tuple[TrainingPlan, ...]:
-    return TrainingPlan(scenario, "ppo-paper", seeds, 210.0), TrainingPlan(scenario, "sac-paper", seeds, 240.0)
+def _process(scenario: str, seeds: int, sac_s: float, sac_decisions: int | None = None) -> tuple[TrainingPlan, ...]:
+    sac = TrainingPlan(scenario, "sac-paper", seeds, sac_s, sac_decisions)
+    return TrainingPlan(scenario, "ppo-paper", seeds, 210.0), sac
 
 
 TRAINING_GROUPS = {
     STOPPED: (
         TrainingPlan("paper-random", "ppo", 1, 6.0, 100_000, mapped=False),
     ),  # a fifteenth of the recipe's decisions
-    RANDOM: _process("paper-random", 5),
-    HIGH: _process("paper-delay-high", 3),
-    LOW: _process("paper-delay-low", 3),
+    RANDOM: _process("paper-random", 5, 3_100.0, 200_000),
+    HIGH: _process("paper-delay-high", 3, 240.0),
+    LOW: _process("paper-delay-low", 3, 240.0),
+    DENSE: (TrainingPlan("paper-delay-low", "ppo-paper", 1, 210.0, terminal=0.0),),
 }
 
 
@@ -93,14 +97,20 @@ def _train(plan: TrainingPlan, run: Path, seed: int, settings: ReproductionSetti
     import ethbrake_marl as eb
 
     if (run / STATUS).is_file():
-        return eb.resume(run, on_progress=settings.tell).status == "finished"
-    scenario, recipe = eb.load_scenario(plan.scenario), eb.load_recipe(plan.recipe)
-    if plan.mapped:
-        scenario = scenario.replace(physics="paper-map")
-    reward = {**recipe.reward.model_dump(mode="json"), "harm_count": SHORT_NAMES["paper"]}
-    recipe = recipe.replace(reward=reward)
-    result = eb.train(recipe, scenario, run, seed=seed, steps=plan.decisions, on_progress=settings.tell)
-    return result.status == "finished"
+        result = eb.resume(run, on_progress=settings.tell)
+    else:
+        scenario, recipe = eb.load_scenario(plan.scenario), eb.load_recipe(plan.recipe)
+        if plan.mapped:
+            scenario = scenario.replace(physics="paper-map")
+        reward = {**recipe.reward.model_dump(mode="json"), "harm_count": SHORT_NAMES["paper"]}
+        if plan.terminal is not None:
+            reward["terminal"] = plan.terminal
+        recipe = recipe.replace(reward=reward)
+        result = eb.train(recipe, scenario, run, seed=seed, steps=plan.decisions, on_progress=settings.tell)
+    finished = result.status == "finished"
+    if finished:
+        (run / SECONDS).write_text(f"{result.evaluations[-1]['cpu_s']:.1f}\n")
+    return finished
 
 
 def unconverged_policy(folder: Path) -> str:
@@ -139,6 +149,7 @@ class Course(NamedTuple):
     returns: LearningCurves  # mean return of training episodes
     harm: LearningCurves  # first-impact harm in a fixed list of worlds (m2/s2)
     decisions: float = 100.0  # of the whole training
+    seconds: float = 0.0  # processor time of a training, mean over seeds
 
     @property
     def values(self) -> Floats:
@@ -161,6 +172,28 @@ class Course(NamedTuple):
         return np.asarray(self.last - self.values[:, 0])
 
     @property
+    def improvement(self) -> float:
+        """Return in the last third of the training minus that in the middle third, mean over seeds."""
+        third = self.values.shape[1] // 3
+        return float((self.values[:, -third:] - self.values[:, -2 * third : -third]).mean())
+
+    @property
+    def is_converged(self) -> bool:
+        """Whether the ``improvement`` is at most 2 % of the mean ``rise``.
+
+        The last quarter alone cannot show it: the learning rate falls, so every training is calm in the end.
+        """
+        return self.improvement <= VERDICT_TOLERANCE * float(self.rise.mean())
+
+    @property
+    def length(self) -> str:
+        """Length of a training and its convergence, in words."""
+        return (
+            f"{self.decisions:,.0f} decisions, {self.seconds:,.0f} CPU-s, last third {self.improvement:+.2f} of"
+            f" {self.rise.mean():.1f}"
+        )
+
+    @property
     def converged(self) -> Floats:
         """Number of decisions until the return has made nine tenths of its ``rise``, [seeds].
 
@@ -169,6 +202,11 @@ class Course(NamedTuple):
         risen = self.values >= (self.values[:, 0] + RISEN * self.rise)[:, np.newaxis]
         progress = np.where(self.rise > 0.0, np.array([*self.returns[0]])[risen.argmax(axis=1)], 100.0)
         return 0.01 * self.decisions * progress
+
+    @property
+    def last_harm(self) -> Floats:
+        """Harm of the last policy, [seeds] m2/s2."""
+        return np.array([curve[100.0] for curve in self.harm])
 
     @property
     def unrest(self) -> Floats:
@@ -188,11 +226,13 @@ def column(run: Path, name: str) -> dict[float, float]:
 
 def course_of(runs: Sequence[Path]) -> Course:
     returns, harm = ([column(run, name) for run in runs] for name in (RETURN, HARM))
-    last = max(harm[0])
+    shared = set.intersection(*map(set, returns))
+    last, seconds = max(harm[0]), [float((run / SECONDS).read_text()) for run in runs]
     returns, harm = (
-        [{100.0 * k / last: x for k, x in curve.items()} for curve in curves] for curves in (returns, harm)
+        [{100.0 * k / last: curve[k] for k in sorted(steps)} for curve in curves]
+        for curves, steps in ((returns, shared), (harm, harm[0]))
     )
-    return Course(returns, harm, last)
+    return Course(returns, harm, last, sum(seconds) / len(seconds))
 
 
 def courses_of(settings: ReproductionSettings, delay: str) -> dict[str, Course]:
@@ -202,15 +242,26 @@ def courses_of(settings: ReproductionSettings, delay: str) -> dict[str, Course]:
     }
 
 
+def judge_trained(name: str, courses: Mapping[str, Course], parts: Sequence[Less], *, numbers: str = "") -> Claim:
+    """Claim with our verdict on a statement about policies that are trained by the paper's process.
+
+    The verdict is "not converged" unless all trainings have converged. ``courses``: the algorithms that the statement
+    is about. ``parts``, ``numbers``: as in ``judge``.
+    """
+    claim = judge(name, parts, numbers=numbers)
+    lengths = "; ".join(f"{algorithm}: {course.length}" for algorithm, course in courses.items())
+    converged = all(course.is_converged for course in courses.values())
+    return claim._replace(ours=f"{claim.ours} ({lengths})", verdict=claim.verdict if converged else "not converged")
+
+
 def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
     """Fig. 2 or 3: learning curves at a high or low ``delay``, and the paper's statements about them.
 
-    Without finished trainings at both delays, the verdict on these statements is "not run".
+    No claim is made without finished trainings at both delays.
     """
     courses = {level: courses_of(settings, level) for level in (HIGH, LOW)}
     if not all(name in courses[level] for level in courses for name in NAMES.values()):
-        why = "needs trainings at both delays; --full does them"
-        return Made([Claim(FIGURE[delay], what, "", "", "not run", why) for what in STATEMENTS[delay]])
+        return Made()
     delay_courses = courses[delay]
     title = f"Learning curves at {delay} delay, the paper's process"
     text = f"{title}: return and harm against progress, mean over seeds; bands: one standard deviation."
@@ -224,64 +275,72 @@ def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
     }
     figure = DrawnFigure(f"learning-{delay}", title, text, curves_figure(panels, "Training progress (%)", text))
     rows = [
-        (
-            name,
-            len(course.harm),
-            *(mean(np.array([course.harm[k][100.0] for k in range(len(course.harm))])), mean(course.last)),
-        )
+        (name, len(course.harm), course.length, mean(course.last_harm), mean(course.last))
         for name, course in delay_courses.items()
     ]
     note = "Harm: first-impact, m²/s², 1,000 worlds of seed 1007. Return: of the last tenth. t intervals over seeds."
-    sheet = Sheet(title, ("Algorithm", Column("Seeds"), Column("Last policy, harm"), Column("Last return")), rows, note)
-    return Made(judge_courses(delay, courses), [sheet], [figure])
+    columns = ("Algorithm", Column("Seeds"), "Length", Column("Last policy, harm"), Column("Last return"))
+    claims = claims_at_high_delay(courses[HIGH]) if delay == HIGH else claims_at_low_delay(courses[HIGH], courses[LOW])
+    if delay == LOW:
+        claims += reward_claims(courses[LOW]["PPO"], courses_of(settings, DENSE))
+    return Made(claims, [Sheet(title, columns, rows, note)], [figure])
 
 
-FIGURE = {HIGH: "Fig. 2", LOW: "Fig. 3"}
-STATEMENTS = {
-    HIGH: (
-        "both algorithms converge steadily",
-        "the final returns are nearly identical across delay settings (here: those of PPO and SAC at one delay)",
-    ),
-    LOW: (
-        "both algorithms reach higher returns than at high delay",
-        "SAC converges faster than PPO",
-        "PPO converges more stably than SAC",
-        "returns of different seeds vary more than at high delay",
-    ),
-}
+def claims_at_high_delay(high: Mapping[str, Course]) -> list[Claim]:
+    """Verdicts on the paper's statements about the learning curves at the high delay. ``high``: algorithm -> curves."""
+    unrest = {name: course.unrest - ALIKE * course.rise for name, course in high.items()}
+    apart = np.abs(high["PPO"].last - high["SAC"].last) - ALIKE * high["PPO"].rise
+    parts = {
+        "steady": [Less(f"{name}: deviation minus a tenth of the rise", mean(unrest[name])) for name in high],
+        "alike": [Less("difference minus a tenth of PPO's rise", mean(apart))],
+        "PPO suits": [Less.of_lists("PPO minus SAC, harm", high["PPO"].last_harm, high["SAC"].last_harm)],
+    }
+    return [judge_trained(name, high, part) for name, part in parts.items()]
 
 
-def judge_courses(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Claim]:
-    """Verdicts on the paper's statements about the learning curves at a high or low ``delay``.
+def claims_at_low_delay(high: Mapping[str, Course], low: Mapping[str, Course]) -> list[Claim]:
+    """Verdicts on the paper's statements about the learning curves at the low delay.
 
-    ``courses``: delay -> algorithm -> learning curves.
+    ``high``, ``low``: at a high and a low delay, algorithm -> curves. That SAC converges faster is at best "undecided":
+    the paper's axis is the progress (%) of trainings, and the paper does not state their lengths.
     """
-    high, low = courses[HIGH], courses[LOW]
-    if delay == HIGH:
-        last_difference = np.abs(high["PPO"].last - high["SAC"].last) - ALIKE * high["PPO"].rise
-        unrest = {name: course.unrest - ALIKE * course.rise for name, course in high.items()}
-        parts = [
-            [Less(f"{name}: deviation minus a tenth of the rise", mean(excess)) for name, excess in unrest.items()],
-            [Less("difference minus a tenth of PPO's rise", mean(last_difference))],
-        ]
-    else:
-        parts = [
-            [Less.of_lists(name, high[name].last, low[name].last) for name in high],
-            [Less.of_lists("SAC minus PPO, decisions", low["SAC"].converged, low["PPO"].converged)],
-            [Less.of_lists("PPO minus SAC, deviation in the last quarter", low["PPO"].unrest, low["SAC"].unrest)],
-            [Less.of_lists(name, high[name].spread, low[name].spread) for name in high],
-        ]
-    claims = [judge(FIGURE[delay], text, part) for text, part in zip(STATEMENTS[delay], parts, strict=True)]
-    return claims if delay == HIGH else [claims[0], convergence_claim(low, claims[1]), *claims[2:]]
+    ppo, sac = low["PPO"], low["SAC"]
+    both = {f"{name}, {HIGH}": course for name, course in high.items()}
+    both |= {f"{name}, {LOW}": course for name, course in low.items()}
+    sooner = ", ".join(f"{name} after {course.converged.mean():,.0f} decisions" for name, course in low.items())
+    faster = [Less.of_lists("SAC minus PPO, decisions", sac.converged, ppo.converged)]
+    claim = judge_trained("faster", low, faster, numbers=f"{sooner} is at nine tenths of its rise")
+    higher = [Less.of_lists(name, high[name].last, low[name].last) for name in high]
+    safer = [Less.of_lists(f"{name}, harm", low[name].last_harm, high[name].last_harm) for name in high]
+    varied = [Less.of_lists(name, high[name].spread, low[name].spread) for name in high]
+    steadier = [Less.of_lists("PPO minus SAC, deviation in the last quarter", ppo.unrest, sac.unrest)]
+    suits = [Less.of_lists("SAC minus PPO, harm", sac.last_harm, ppo.last_harm)]
+    return [
+        claim._replace(verdict="undecided") if claim.verdict != "not converged" else claim,
+        judge_trained("higher", both, higher),
+        judge_trained("safer", both, safer),
+        judge_trained("steadier", low, steadier),
+        judge_trained("varied", both, varied),
+        judge_trained("SAC suits", low, suits),
+    ]
 
 
-def convergence_claim(courses: Mapping[str, Course], by_decisions: Claim) -> Claim:
-    """Verdict on the statement that SAC converges faster than PPO: always "undecided".
+def reward_claims(sparse: Course, dense: Mapping[str, Course]) -> list[Claim]:
+    """Verdicts on what the terminal reward does at the low delay: PPO trained with it (``sparse``) and without it.
 
-    The paper's axis is the progress (%) of trainings, but the paper does not state their lengths. ``courses``:
-    algorithm -> learning curves. ``by_decisions``: the verdict if convergence is counted in decisions.
+    Empty if there is no training without it.
     """
-    ends = {name: (course.converged.mean(), course.decisions) for name, course in courses.items()}
-    text = ", ".join(f"{name} after {at:,.0f} of {total:,.0f} decisions" for name, (at, total) in ends.items())
-    why = f"in decisions or in % of the training? The lengths are ours: {text} is at nine tenths of its rise"
-    return by_decisions._replace(ours=f"by decisions it {by_decisions.ours}", outcome="undecided", why=why)
+    if not dense:
+        return []
+    (course,) = dense.values()
+    with_it, without = ((curve.unrest / curve.rise).mean() for curve in (sparse, course))
+    both = {"with": sparse, "without": course}
+    unrest = (
+        f"deviation in the last quarter {100.0 * with_it:.1f} % of the rise with it, {100.0 * without:.1f} % without"
+    )
+    harm = [curve.last_harm.mean() for curve in (sparse, course)]
+    rates = f"harm {harm[0]:.2f} with it, {harm[1]:.2f} without"
+    return [
+        judge_trained("sparse", both, [Less("", Estimate(without - with_it, None))], numbers=unrest),
+        judge_trained("terminal", both, [Less("", Estimate(harm[0] - harm[1], None))], numbers=rates),
+    ]

@@ -51,6 +51,7 @@ WORLD_FIELDS = (
 )  # fields that change worlds, physics
 PLANS = ("base", "acts_s", "rear_s", "others", "seed", "plans_as_stated", "star")  # that change what E-V2X-BM plans
 
+ROUNDING = 1e-9  # larger differences of harm (m2/s2) or deceleration (m/s2) are no rounding errors
 SHORT_STEP_S = 0.02  # between decisions, where what follows an impact begins at the next decision
 
 RandomTable = Mapping[str, tuple[Estimate, Estimate]]  # row -> collision rate, and mean harm (m2/s2)
@@ -61,6 +62,11 @@ RandomOutcome = Mapping[str, NDArray[Any]]  # collided [n]; first, total: harm [
 
 def outcome_of(last: State) -> RandomOutcome:
     return {"collided": last.collided, "first": last.harm("first"), "total": last.harm("total")}
+
+
+def avoided_text(policy: Bools, baseline: Bools) -> str:
+    """In how many worlds a policy avoids a collision of the baseline, and adds one. Both: collided, [n]."""
+    return f"avoids {(baseline & ~policy).sum():,}, adds {(policy & ~baseline).sum():,} of {len(policy):,}"
 
 
 def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED_SPECS) -> RandomTable:

@@ -10,6 +10,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 RANDOM = "paper-random"
 
+Star = Literal["low end", "middle", "high end"]
 ReportedHarm = Literal["realised", "predicted", "predicted harm, realised collisions"]
 
 FIELD_TEXTS = {  # field of a reading -> its default in words, and another value
@@ -49,7 +50,7 @@ class Reading(NamedTuple):
     counted: Literal["first", "total"] = "first"  # harm of each pair's first impact, or of every impact
     after_impact: Literal["brakes on", "coasts", "ends"] = "brakes on"  # what vehicles, or the episode, do under Non-E
     plans_as_stated: bool = False  # E-V2X-BM plans for the scenario's latencies, not for ``acts_s`` and ``rear_s``
-    star: Literal["low end", "middle", "high end"] = "middle"  # which of the decelerations with the least harm
+    star: Star = "middle"  # which of the decelerations with the least harm
     baseline: ReportedHarm = "realised"  # what to report of E-V2X-BM: simulation or prediction
     # what to report of the hybrid (Algorithm 1, with the pairwise H*): simulation, or the prediction min(H_RL, H*)
     hybrid: ReportedHarm | Literal["realised, by the coupled H*", "policy alone"] = "realised"

@@ -16,6 +16,7 @@ from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,
     NON_E,
     PLANS,
+    ROUNDING,
     WORLD_FIELDS,
     RandomOutcome,
     algorithm_1,
@@ -54,6 +55,11 @@ def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> 
             least = {PREDICTED: np.minimum(outcomes[name]["first"], bound[PREDICTED])}
             outcomes[f"Hybrid {name}{ending}"] = {**algorithm_1(outcomes[name], bound, bound[PREDICTED]), **least}
     return outcomes
+
+
+def above_bound(hybrid: RandomOutcome) -> int:
+    """Number of worlds in which a hybrid does more harm than its H* and its policy's harm foretell."""
+    return int(np.count_nonzero(hybrid["first"] > hybrid[PREDICTED] + ROUNDING))
 
 
 def process_outcomes(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 
 import numpy as np
@@ -14,7 +14,7 @@ from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, ne
 from ethbrake_marl.extensions.reproduction.learning import process
 from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
-from ethbrake_marl.extensions.reproduction.verdicts import Claim, Verdict
+from ethbrake_marl.extensions.reproduction.verdicts import Claim
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game, teams_of
@@ -102,13 +102,13 @@ def reproduce_trajectories(settings: ReproductionSettings) -> Made:
         )
         parts.append(
             {
-                "positions under PPO and SAC are more alike in Scenario 1 than in 2": (
+                "alike in Scenario 1": (
                     f"root mean square {smaller:.2f} m against {larger:.2f} m", smaller - larger,
                 ),
-                "Scenario 2: PPO keeps the larger distance to Vehicle 3": (
+                "PPO from Vehicle 3": (
                     f"mean gap {sac_2:.2f} m under SAC, {ppo_2:.2f} m under PPO", sac_2 - ppo_2,
                 ),
-                "Scenario 2: SAC keeps the larger distance to Vehicle 1": (
+                "SAC from Vehicle 1": (
                     f"mean gap {ppo_1:.2f} m under PPO, {sac_1:.2f} m under SAC", ppo_1 - sac_1,
                 ),
             }
@@ -127,7 +127,7 @@ def reproduce_trajectories(settings: ReproductionSettings) -> Made:
     numbers = ("Impacts", "First-impact harm", "Total harm", "Last gap 1 (m)", "Last gap 2 (m)")
     note = f"One world each: no intervals. Exact physics; harm in m²/s². {settings.who_drives}"
     sheet = Sheet("How the episodes end", ("Reading", "Scenario", "Policy", *map(Column, numbers)), rows, note)
-    return Made(claims_of("Fig. 6", parts), [sheet], figures)
+    return Made(claims_of(parts), [sheet], figures)
 
 
 def reproduce_accelerations(settings: ReproductionSettings) -> Made:
@@ -141,14 +141,14 @@ def reproduce_accelerations(settings: ReproductionSettings) -> Made:
         # statement -> (what we measured, a number below 0 if the statement holds)
         parts.append(
             {
-                "profiles of PPO and SAC are more alike in Scenario 1 than in 2": (
+                "alike in Scenario 1": (
                     f"root mean square difference {in_1:.2f} m/s² against {in_2:.2f} m/s²", in_1 - in_2,
                 ),
-                "Scenario 2: PPO accelerates before it brakes": (f"first command {first:+.2f} m/s²", -first),
-                "Scenario 2: SAC decelerates throughout most of it": (
+                "PPO accelerates": (f"first command {first:+.2f} m/s²", -first),
+                "SAC decelerates": (
                     f"braking in {100.0 * braking:.0f} % of the time it moves", 0.5 - braking,
                 ),
-                "Scenario 2: PPO's profile is the smoother one": (
+                "PPO is smoother": (
                     f"ups and downs {ppo_changes:.1f} m/s² under PPO, {sac_changes:.1f} m/s² under SAC",
                     ppo_changes - sac_changes,
                 ),
@@ -171,7 +171,7 @@ def reproduce_accelerations(settings: ReproductionSettings) -> Made:
     )
     note = "Commands of Vehicle 2 in m/s². One world each: no intervals."
     sheet = Sheet("Commands of Vehicle 2", ("Reading", "Scenario", "Policy", *numbers), rows, note)
-    return Made(claims_of("Fig. 7", parts), [sheet], [figure])
+    return Made(claims_of(parts), [sheet], [figure])
 
 
 def resample_pair(records: Records, number: int, what: str, column: int) -> list[Floats]:
@@ -194,21 +194,16 @@ def policy_difference(records: Records, number: int, what: str) -> float:
     return float(np.sqrt(np.mean((ppo - sac) * (ppo - sac))))
 
 
-def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[Claim]:
+def claims_of(readings: Sequence[Mapping[str, tuple[str, float]]]) -> list[Claim]:
     """Verdicts on claims of the paper that one quantity is smaller than another in a single world.
 
     ``readings``: results with the parameters as stated, then in the nearest reading. Each maps a claim to numbers in
     words, and to the smaller quantity minus the larger one.
     """
     claims = []
-    for text in readings[0]:
-        (words, stated), (_, nearest) = (reading[text] for reading in readings)
-        ours, near = ("holds" if value < 0.0 else "does not hold" for value in (stated, nearest))
-        outcome: Verdict = "agrees" if stated < 0.0 else "undecided"
-        why = (
-            f"with our policies, {words}" if stated < 0.0 else f"our policies do not show it, the paper's may ({words})"
-        )
-        claims.append(Claim(where, text, ours, near, outcome, why))
+    for name, (words, stated) in readings[0].items():
+        ours, nearest = ("holds" if value < 0.0 else "does not hold" for value in (stated, readings[1][name][1]))
+        claims.append(Claim(name, f"{ours}: {words}", nearest, "agrees" if stated < 0.0 else "undecided"))
     return claims
 
 

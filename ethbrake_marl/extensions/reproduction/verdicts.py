@@ -1,7 +1,8 @@
 """Verdicts on the claims of the paper, and the table that lists them.
 
-The table's columns are: a claim of the paper, our result with the parameters as stated, our result in the *nearest
-reading* (the interpretation of the paper that comes nearest to the printed numbers), and the verdict with a reason.
+The table's columns are: a sentence of the paper, our result with the parameters as stated, our result in the *nearest
+reading* (the interpretation of the paper that comes nearest to the printed numbers), the verdict, and a reason. People
+write the sentences and the reasons (``sentences.yaml``); the program writes results and verdicts.
 
 The *chance difference* is the largest difference (95 %) that chance alone causes between the means of two random lists
 of worlds: sqrt(2) times half the width of the 95 % interval. The verdict on a printed number is the first that applies:
@@ -12,47 +13,62 @@ of worlds: sqrt(2) times half the width of the 95 % interval. The verdict on a p
 - *differs* otherwise.
 
 A statement of the paper says that some quantities are smaller than others. It *agrees* if the interval of every
-difference (smaller minus larger) is below 0, is *undecided* if the remaining intervals contain 0, and else *differs*.
+difference (smaller minus larger) is below 0, is *undecided* if the remaining intervals contain 0, and else *differs*. A
+statement about a training that has not converged has no other verdict than *not converged*.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
-from ethbrake_marl.evaluation.statistics import difference, mean, unpaired_difference
+from ethbrake_marl.evaluation.statistics import difference, mean, rate, unpaired_difference
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.files.yaml import read_yaml
+from ethbrake_marl.motion.layout import Bools, Floats
 
-Verdict = Literal["agrees", "differs", "cannot be", "undecided", "not run"]
+Verdict = Literal["agrees", "differs", "cannot be", "undecided", "not converged", "not run"]
 
 VERDICT_TOLERANCE = 0.02
 
 HARM, PERCENT = Column("Harm"), Column("Collision rate", digits=1, scale=100.0, unit=" %")
 DIFFERENCE = Column("Difference", sign="+")
+COLUMNS = "Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Verdict", "Why"
 
 
 class Claim(NamedTuple):
-    """A number or statement of the paper, our results, and our verdict."""
+    """Our results on a number or statement of the paper, and our verdict."""
 
-    where: str  # place in the paper
-    paper: str  # what the paper says
+    name: str  # in its item
     ours: str  # our result with the parameters as stated
     nearest: str  # our result in the nearest reading
-    outcome: Verdict  # on our result as stated
-    why: str
-
-    @property
-    def verdict(self) -> str:
-        link = " because " if self.outcome in ("differs", "cannot be") else ": "
-        return f"{self.outcome}{link}{self.why}" if self.why else self.outcome
+    verdict: Verdict  # on our result as stated
 
 
-def claims_sheet(claims: Sequence[Claim]) -> Sheet:
-    rows = [(claim.where, claim.paper, claim.ours, claim.nearest, claim.verdict) for claim in claims]
-    headings = "Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Why"
-    return Sheet("", [Column(heading, text=True) for heading in headings], rows)
+@cache
+def paper_texts() -> Mapping[str, Any]:
+    """Content of ``sentences.yaml``: sentences of the paper with our reasons, and changes that make claims true."""
+    content: Mapping[str, Any] = read_yaml(Path(__file__).with_name("sentences.yaml")).content
+    return content
+
+
+def sentences_sheet(claims: Mapping[str, Mapping[str, Claim]], *, reasons: bool = True) -> Sheet:
+    """Table of the paper's sentences, in the paper's order: our results, the verdict and the reason for this verdict.
+
+    ``claims``: item -> name -> claim. A sentence of an item that has no such claim was not run, and a sentence of
+    another item is left out. ``reasons``: whether the reasons apply, which are written for the shipped policies.
+    """
+    rows = []
+    for sentence in paper_texts()["sentences"]:
+        item, name = sentence["result"].split("/")
+        if item in claims:
+            claim = claims[item].get(name, Claim(name, "", "", "not run"))
+            why = sentence["why"].get(claim.verdict, "") if reasons else ""
+            rows.append((sentence["where"], sentence["paper"], *claim[1:], why))
+    return Sheet("", [Column(heading, text=True) for heading in COLUMNS], rows)
 
 
 def chance_difference(ours: Estimate) -> float:
@@ -115,22 +131,18 @@ def judge_statement(parts: Sequence[Less], show: Column = DIFFERENCE) -> tuple[s
     return text, ("undecided" if undecided else "differs") if failing else "agrees", numbers
 
 
-def judge(
-    where: str,
-    paper: str,
-    stated: Sequence[Less],
-    nearest: Sequence[Less] = (),
-    *,
-    why: str = "",
-    show: Column = DIFFERENCE,
-) -> Claim:
+def judge(name: str, stated: Sequence[Less], nearest: Sequence[Less] = (), *, numbers: str = "") -> Claim:
     """Claim with our verdict on a statement of the paper.
 
-    ``where``, ``paper``: place and words of the statement. ``stated``, ``nearest``: comparisons with the parameters as
-    stated, and in the nearest reading. ``why``: reason to show if the verdict is "differs". ``show``: format of
-    numbers.
+    ``stated``, ``nearest``: comparisons with the parameters as stated, and in the nearest reading. ``numbers``: what to
+    show beside the result; "": the differences that decide.
     """
-    ours, outcome, numbers = judge_statement(stated, show)
-    nearest_result = judge_statement(nearest, show)[0] if nearest else ""
-    text = f"{why} ({numbers})" if why and outcome == "differs" else numbers
-    return Claim(where, paper, ours, nearest_result, outcome, text)
+    text, verdict, details = judge_statement(stated)
+    nearest_result = judge_statement(nearest)[0] if nearest else ""
+    return Claim(name, f"{text}: {numbers or details}", nearest_result, verdict)
+
+
+def judge_share(name: str, holds: Bools, of_what: str) -> Claim:
+    """Claim with our verdict on a statement about every world: *agrees* if it holds in all of them, [n]."""
+    ours = f"holds in {PERCENT.show(rate(holds)).in_words} of {len(holds):,} {of_what}" if len(holds) else ""
+    return Claim(name, ours, "", ("agrees" if holds.all() else "differs") if len(holds) else "undecided")

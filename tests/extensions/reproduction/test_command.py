@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import AlreadyExists
-from ethbrake_marl.extensions.reproduction import items
+from ethbrake_marl.extensions.reproduction import items, verdicts
 from ethbrake_marl.extensions.reproduction.made import Item, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.verdicts import Claim
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
@@ -14,19 +14,19 @@ from tests.refused import refused
 
 
 def test_list__has_the_items_in_the_order_of_the_paper(ethbrake: Command) -> None:
-    rows = told_json(ethbrake("reproduce", "gaps", "learning-low", "random-table", "--list", "--json"))
-    assert [row["Item"] for row in rows] == ["random-table", "learning-low", "gaps"]
-    assert [row["Label in the paper"] for row in rows] == ["Table:Random", "fig:ppo_sac_low_latency", ""]
+    rows = told_json(ethbrake("reproduce", "gaps", "learning-low", "random-table", "changes", "--list", "--json"))
+    assert [row["Item"] for row in rows] == ["changes", "random-table", "learning-low", "gaps"]
+    assert [row["Label in the paper"] for row in rows] == ["", "Table:Random", "fig:ppo_sac_low_latency", ""]
 
 
 def test_cost__counts_the_trainings_that_are_missing(ethbrake: Command, empty_folder: Path) -> None:
     quick = ethbrake("reproduce", "hybrid-table", "learning-low", "--cost").err
     assert "to do: 2 items, at most about 6 s of one core; trainings before them about 0.1 min" in quick
     full = ethbrake("reproduce", "hybrid-table", "learning-low", "gaps", "--full", "--cost").err
-    # trainings: 2 x 3 x (210 + 240) s, and 6 s
-    assert "3 items, at most about 26 s of one core; trainings before them about 45.1 min" in full
+    # trainings: 2 x 3 x (210 + 240) s, 210 s without a terminal reward, and 6 s
+    assert "3 items, at most about 18 s of one core; trainings before them about 48.6 min" in full
     assert "about 45.0 min" in ethbrake("reproduce", "learning-high", "--full", "--cost").err
-    assert "about 37.5 min" in ethbrake("reproduce", "trajectories", "--full", "--cost").err
+    assert "about 275.8 min" in ethbrake("reproduce", "trajectories", "--full", "--cost").err
     assert "trainings" not in ethbrake("reproduce", "gaps", "trajectories", "--cost").err
     assert not list(empty_folder.iterdir())
 
@@ -35,16 +35,21 @@ def test_reproduce__writes_page_figures_and_tables(ethbrake: Command, empty_fold
     done = ethbrake("reproduce", "accelerations", "--episodes", "3", "--output", "out", "--json")
     (result,) = told_json(done)
     assert result["name"] == "accelerations" and len(result["tables"]["Commands of Vehicle 2"]) == 8
-    assert [each["outcome"] for each in result["claims"]] == ["undecided", "agrees", "agrees", "undecided"]
+    assert [each["Verdict"] for each in result["claims"]] == ["undecided", "agrees", "agrees", "undecided"]
+    assert [each["Why"] != "" for each in result["claims"]] == [True] * 4
     page = Path("out/README.md").read_text("utf-8")
-    assert "Made by `ethbrake reproduce accelerations --quick --episodes 3` on 20" in page
+    assert "Made by `ethbrake reproduce accelerations --episodes 3` on 20" in page
     assert f"version {result['version']}, physics {result['physics_digest']})" in page
     assert "](accelerations/accelerations.svg)" in page and "need --full" in page
     folder = Path("out/accelerations")
     for name in ("accelerations.svg", "accelerations.pdf", "commands-of-vehicle-2.csv", "commands-of-vehicle-2.tex"):
         assert (folder / name).stat().st_size > 200
-    assert [row["The paper"] for row in rows_of(Path("out/claims.csv"))] == [each["paper"] for each in result["claims"]]
-    assert Path("out/claims.tex").read_text("utf-8").startswith("\\begin{tabular}{lllll}\n\\toprule\nWhere & The paper")
+    assert [row["The paper"] for row in rows_of(Path("out/claims.csv"))] == [
+        each["The paper"] for each in result["claims"]
+    ]
+    assert (
+        Path("out/claims.tex").read_text("utf-8").startswith("\\begin{tabular}{llllll}\n\\toprule\nWhere & The paper")
+    )
     assert done.err.endswith("page: out/README.md\n")
 
 
@@ -53,24 +58,37 @@ def test_policies__of_the_user_drive_and_the_page_says_so(ethbrake: Command, emp
     ((rows,),) = (result["tables"].values() for result in told_json(done))
     harm = {row.pop("Strategy"): row for row in rows}
     assert harm["PPO"] == harm["Non-E"] != harm["SAC"]
+    assert all(row["Why"] == "" for row in rows_of(Path("out/claims.csv")))  # reasons are for the shipped policies
     page = Path("out/README.md").read_text("utf-8")
     assert "PPO is full_brake, SAC is sac." in page and "shipped" not in page
-    assert "`ethbrake reproduce harm-delays --quick --policies ppo=full_brake,sac=sac` on" in page
+    assert "`ethbrake reproduce harm-delays --policies ppo=full_brake,sac=sac` on" in page
 
 
-def planted(why: str) -> Item:
+SENTENCE = {"where": "Fig. 9", "paper": "H* is less", "result": "gaps/less", "why": {"agrees": "so it is"}}
+
+
+@pytest.fixture
+def planted_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = {"lead": "A lead.", "sentences": [SENTENCE]}
+    for module in (items, verdicts):
+        monkeypatch.setattr(module, "paper_texts", lambda: texts)
+
+
+def planted(ours: str) -> Item:
     sheet = Sheet("A table, 1 m/s", ("Who", Column("Harm")), [("PPO | H*", Estimate(1.5, (1.25, 1.75)))], "Of 24.")
-    made = Made([Claim("Fig. 9", "H* is less", "holds", "", "agrees", why)], [sheet], notes=["A note."])
+    made = Made([Claim("less", ours, "", "agrees")], [sheet], notes=["A note."])
     return Item("gaps", ("Fig:x",), "A title", "What it is.", lambda settings: made, 1.0)
 
 
+@pytest.mark.usefixtures("planted_sentence")
 def test_page__by_hand_and_results_are_replaced_by_force_alone(tmp_path: Path) -> None:
     settings = ReproductionSettings(tmp_path / "out", episodes=24)
     items.reproduce(settings, [planted("b")], "a machine")
     text = (tmp_path / "out/README.md").read_text("utf-8")
-    _, rest = text.split("| Where | The paper | Ours, as stated | Ours, nearest reading | Why |\n")
+    _, rest = text.split("## The paper, sentence by sentence\n\n")
     assert rest == (
-        "| --- | --- | --- | --- | --- |\n| Fig. 9 | H\\* is less | holds |  | agrees: b |\n\n"
+        "A lead.\n\n| Where | The paper | Ours, as stated | Ours, nearest reading | Verdict | Why |\n"
+        "| --- | --- | --- | --- | --- | --- |\n| Fig. 9 | H\\* is less | b |  | agrees | so it is |\n\n"
         "## A title\n\nWhat it is. In the paper's source: `Fig:x`. Command: `ethbrake reproduce gaps`.\n\nA note.\n\n"
         "### A table, 1 m/s\n\n| Who | Harm |\n| --- | ---: |\n| PPO \\| H\\* | 1.50 [1.25, 1.75] |\n\nOf 24.\n"
     )
@@ -79,7 +97,7 @@ def test_page__by_hand_and_results_are_replaced_by_force_alone(tmp_path: Path) -
     with refused("README.md: already exists", AlreadyExists):
         items.reproduce(settings, [planted("c")], "m")
     items.reproduce(settings, [planted("d")], "m", force=True)
-    assert "agrees: d" in (settings.folder / items.RESULTS_FILE).read_text()
+    assert "| d |  | agrees | so it is |" in (settings.folder / items.RESULTS_FILE).read_text()
 
 
 def test_interrupted__training_makes_no_item(tmp_path: Path, monkeypatch, ethbrake: Command) -> None:
@@ -93,7 +111,6 @@ def test_interrupted__training_makes_no_item(tmp_path: Path, monkeypatch, ethbra
     ("line", "message"),
     [
         ("gasp", "unknown item 'gasp'; did you mean 'gaps'?"),
-        ("--quick --full", "--quick and --full cannot be combined"),
         ("--episodes 1", "--episodes"),
         ("--policies dqn=ppo", "--policies dqn=ppo: 'dqn=ppo': must be ppo=AGENT or sac=AGENT"),
         ("--policies ppo", "'ppo': must be ppo=AGENT"),

@@ -8,11 +8,13 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.reproduction import learning
-from ethbrake_marl.extensions.reproduction.learning import HIGH, LOW, RANDOM, STOPPED, Course, TrainingPlan
+from ethbrake_marl.extensions.reproduction.learning import DENSE, HIGH, LOW, RANDOM, STOPPED, Course, TrainingPlan
 from ethbrake_marl.extensions.reproduction.made import ReproductionSettings
 from ethbrake_marl.extensions.reproduction.readings import STATED
 from ethbrake_marl.extensions.reproduction.tables import process_sheet
 from ethbrake_marl.extensions.reproduction.trajectories import all_records
+from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less
+from ethbrake_marl.files.sheet import Estimate
 
 pytest.importorskip("torch")
 
@@ -36,39 +38,75 @@ def runs(*returns, apart: float = 0.001) -> Course:
     return course(*(np.array(returns) + apart * seed for seed in range(3)))
 
 
+def verdicts_of(claims: list[Claim]) -> dict[str, str]:
+    return {claim.name: claim.verdict for claim in claims}
+
+
+def test_convergence__is_a_last_third_that_improves_by_2_percent_of_the_rise_at_most() -> None:
+    still = course([0.0, 50.0, 90.0, 90.0, 96.0, 96.0])  # 6 of 96
+    rested = course([0.0, 50.0, 90.0, 90.0, 91.5, 91.5])  # 1.5 of 91.5
+    assert (still.improvement, rested.improvement) == (6.0, 1.5)
+    assert not still.is_converged and rested.is_converged
+    assert course([0.0, 50.0, 90.0, 90.0, 70.0, 70.0]).is_converged
+    assert (
+        still._replace(decisions=2_000.0, seconds=31.4).length == "2,000 decisions, 31 CPU-s, last third +6.00 of 96.0"
+    )
+
+
+def test_no_verdict__rests_on_a_training_that_still_improves() -> None:
+    still, rested = runs(0, 50, 90, 90, 96, 96), runs(0, 50, 90, 90, 91, 91)
+    less = [Less("a", Estimate(-1.0, (-2.0, -0.5)))]
+    assert learning.judge_trained("x", {"PPO": rested}, less).verdict == "agrees"
+    claim = learning.judge_trained("x", {"PPO": rested, "SAC": still}, less)
+    assert claim.verdict == "not converged"
+    assert claim.ours == f"holds: a, -1.00 [-2.00, -0.50] (PPO: {rested.length}; SAC: {still.length})"
+
+
 def test_statements__by_planted_courses() -> None:
-    high = {"SAC": runs(-90, -22, -21, -20, -19, -20, apart=0.002), "PPO": runs(-90, -40, -30, -21, -21, -21)}
-    three = course([-90, -40, -30, -10, -10, -10.1], [-90, -40, -30, -12, -12, -12.1], [-90, -40, -30, -14, -14, -14.2])
+    high = {"SAC": runs(-90, -22, -21, -20, -19, -20, apart=0.002), "PPO": runs(-90, -40, -21, -21, -21, -21)}
+    three = course([-90, -40, -10, -10, -10, -10.1], [-90, -40, -12, -12, -12, -12.1], [-90, -40, -14, -14, -14, -14.2])
     low = {"SAC": runs(-90, -10, -10, -8, -12, -8), "PPO": three}  # SAC is at nine tenths sooner, and restless
 
-    def outcomes(delay: str, high: dict[str, Course], low: dict[str, Course]) -> list[str]:
-        claims = learning.judge_courses(delay, {HIGH: high, LOW: low})
-        assert [each.paper for each in claims] == [*learning.STATEMENTS[delay]]
-        assert {each.where for each in claims} == {learning.FIGURE[delay]}
-        return [each.outcome for each in claims]
-
-    assert outcomes(HIGH, high, low) == ["agrees", "agrees"]  # 1 apart, of a rise by 69
-    assert outcomes(HIGH, {**high, "PPO": runs(-90, -40, -31, -31)}, low) == ["agrees", "differs"]  # 11 apart, of 59
-    restless = {**high, "SAC": runs(-90, -20, -60, -5, -50, -20)}
-    assert outcomes(HIGH, restless, low)[0] == "differs"
-    assert outcomes(LOW, high, low) == [
-        "agrees",
-        "undecided",
-        "agrees",
-        "undecided",
-    ]  # three seeds cannot tell the last
-    assert outcomes(LOW, low, high) == ["differs", "undecided", "agrees", "undecided"]
-    _, faster, *_ = learning.judge_courses(LOW, {HIGH: high, LOW: low})
-    assert faster.ours == "by decisions it holds" and "SAC after 33 of 100 decisions, PPO after 67" in faster.why
+    at_high = learning.claims_at_high_delay
+    assert verdicts_of(at_high(high)) == {"steady": "agrees", "alike": "agrees", "PPO suits": "agrees"}  # 1 of 69 apart
+    far = {**high, "PPO": runs(-90, -40, -31, -31, -31, -31)}
+    assert verdicts_of(at_high(far))["alike"] == "differs"  # 11 apart, of 59
+    assert verdicts_of(at_high({**high, "SAC": runs(-90, -20, -5, -50, -5, -50)}))["steady"] == "differs"
+    assert verdicts_of(learning.claims_at_low_delay(high, low)) == {
+        "faster": "undecided", "higher": "agrees", "safer": "differs", "steadier": "agrees",
+        "varied": "undecided", "SAC suits": "undecided",
+    }  # fmt: skip
+    swapped = verdicts_of(learning.claims_at_low_delay(low, high))
+    assert (swapped["higher"], swapped["safer"], swapped["faster"]) == ("differs", "agrees", "undecided")
+    faster, *_ = learning.claims_at_low_delay(high, low)
+    assert faster.ours.startswith("holds: SAC after 33 decisions, PPO after 50 decisions is at nine tenths")
     wide = {name: course([-90, 0, -9], [-90, 0, -2], [-90, 0, -9], [-90, 0, -2]) for name in low}
-    assert outcomes(LOW, high, wide)[3] == "agrees" and outcomes(LOW, wide, high)[3] == "differs"
-    assert outcomes(LOW, high, {"SAC": low["PPO"], "PPO": low["SAC"]})[:3] == ["agrees", "undecided", "differs"]
+    assert verdicts_of(learning.claims_at_low_delay(high, wide))["varied"] == "agrees"
+    assert verdicts_of(learning.claims_at_low_delay(wide, high))["varied"] == "differs"
+    unrested = {**low, "PPO": runs(-90, -40, -30, -20, -10, -9)}
+    assert {*verdicts_of(learning.claims_at_low_delay(high, unrested)).values()} == {"not converged"}
+    of_both = [name for name, verdict in verdicts_of(learning.claims_at_low_delay(unrested, low)).items()
+               if verdict == "not converged"]  # fmt: skip
+    assert of_both == ["higher", "safer", "varied"]
+
+
+def test_reward__with_and_without_its_terminal_part() -> None:
+    calm, restless = course([-90, -10, -10, -10, -10, -10]), course([-90, -10, -10, -10, -14, -6])
+    harm = calm._replace(harm=[{100.0: 2.0}])
+    assert learning.reward_claims(calm, {}) == []
+    sparse, terminal = learning.reward_claims(restless._replace(harm=[{100.0: 3.0}]), {"PPO": harm})
+    assert (sparse.verdict, terminal.verdict) == ("agrees", "differs")
+    assert sparse.ours.startswith(
+        "holds: deviation in the last quarter 6.7 % of the rise with it, 0.0 % without (with: "
+    )
+    assert terminal.ours.startswith("does not hold: harm 3.00 with it, 2.00 without (with: ")
 
 
 def plant(run: Path, end: float, status: str = "finished") -> None:
     """A run whose harm falls to ``end``; its table has the return in every row, and the harm in some."""
     run.mkdir(parents=True)
     (run / "run.json").write_text(f'{{"status": "{status}"}}')
+    (run / learning.SECONDS).write_text(f"{end}\n")
     rows = [f"{500 * k},{-9.0 + k},{'' if k % 2 else end + 4.0 - k}" for k in range(1, 5)]
     (run / "progress.csv").write_text("\n".join([f"steps,{learning.RETURN},{learning.HARM}", *rows]))
 
@@ -81,7 +119,10 @@ def test_curves__have_the_columns_of_the_runs(tmp_path: Path) -> None:
                 plant(run, 10.0 * number + seed)
     made = learning.reproduce_curves(HIGH, full)
     assert [row[:2] for row in made.sheets[0].rows] == [("PPO", 3), ("SAC", 3)]
-    assert [[cell.value for cell in row[2:]] for row in made.sheets[0].rows] == [[1.0, -5.0], [11.0, -5.0]]
+    assert [[cell.value for cell in row[3:]] for row in made.sheets[0].rows] == [[1.0, -5.0], [11.0, -5.0]]
+    assert made.sheets[0].rows[1][2].startswith("2,000 decisions, 11 CPU-s, last third +1.00")
+    assert {claim.verdict for claim in made.claims} == {"not converged"}
+    assert [claim.name for claim in made.claims] == ["steady", "alike", "PPO suits"]
     returns, harm = made.figures[0].figure.axes
     assert returns.lines[0].get_xdata().tolist() == [25.0, 50.0, 75.0, 100.0]
     assert harm.lines[1].get_ydata().tolist() == [13.0, 11.0] and harm.get_xlabel() == "Training progress (%)"
@@ -92,16 +133,23 @@ def test_curves__have_the_columns_of_the_runs(tmp_path: Path) -> None:
     assert learning.seconds_left(tmp_path, [HIGH, LOW]) == 240.0
     for settings in (full, ReproductionSettings(tmp_path)):
         missing = learning.reproduce_curves(HIGH, settings)
-        assert [each.outcome for each in missing.claims] == ["not run"] * 2 and not missing.figures
+        assert not missing.claims and not missing.figures
 
 
 def test_plans__are_of_the_papers_map_and_shipped_recipes() -> None:
     for group, plans in learning.TRAINING_GROUPS.items():
         for plan in plans:
             recipe, _ = eb.load_recipe(plan.recipe), eb.load_scenario(plan.scenario)
-            expected = (1, False, 100_000) if group == STOPPED else (5 if group == RANDOM else 3, True, None)
-            assert (plan.seeds, plan.mapped, plan.decisions) == expected
-            assert plan.decisions is None or plan.decisions < recipe.total_steps / 10
+            seeds = {STOPPED: 1, RANDOM: 5, DENSE: 1}.get(group, 3)
+            assert (plan.seeds, plan.mapped, plan.terminal) == (
+                seeds,
+                group != STOPPED,
+                0.0 if group == DENSE else None,
+            )
+            if group == STOPPED:
+                assert plan.decisions < recipe.total_steps / 10
+            else:
+                assert plan.decisions == (200_000 if (group, plan.recipe) == (RANDOM, "sac-paper") else None)
 
 
 TINY = {"n_steps": 16, "batch_size": 64, "n_epochs": 1, "total_steps": 1024, "network": {"policy": [8], "value": [8]},
@@ -138,6 +186,7 @@ def test_process__is_trained_once_in_the_papers_map_and_shown(tiny: Reproduction
     assert process_sheet(tiny, STATED, 20) == []
     assert learning.train_groups(tiny, [RANDOM])
     seeds = learning.finished_runs(tiny.folder, RANDOM)["ppo-paper"]
+    assert all(float((run / learning.SECONDS).read_text()) > 0.0 for run in seeds)
     before = [(run / "run.json").stat().st_mtime_ns for run in seeds]
     assert learning.train_groups(tiny, [RANDOM]) and before == [(run / "run.json").stat().st_mtime_ns for run in seeds]
     mapped = eb.load_scenario("paper-random").replace(physics="paper-map")

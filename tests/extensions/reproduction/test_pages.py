@@ -1,19 +1,20 @@
 """The pages about the reproduction: their numbers and claims are those of today's code."""
 
 import re
+from typing import get_args
 
 import pytest
 
 from ethbrake_marl import __version__
 from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.report.style import picture_bytes
-from ethbrake_marl.extensions.reproduction import curves, strategies, tables
-from ethbrake_marl.extensions.reproduction.documents import markdown
+from ethbrake_marl.extensions.reproduction import curves, learning, strategies, tables
 from ethbrake_marl.extensions.reproduction.items import ITEMS
+from ethbrake_marl.extensions.reproduction.learning import Course
 from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import NON_E, SHIPPED_SPECS, report_outcome
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED
-from ethbrake_marl.extensions.reproduction.verdicts import claims_sheet
+from ethbrake_marl.extensions.reproduction.verdicts import Verdict, paper_texts
 from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.site import DOCS, load
 
@@ -32,28 +33,59 @@ def test_sampling__prints_the_errors_that_the_page_tells(agent: str) -> None:
     assert picture_bytes(sampling.draw([study]), "study.png").startswith(b"\x89PNG")
 
 
-def claims_of(page: str) -> list[str]:
-    """The rows of the table of claims of a page, as Markdown."""
-    table = page.split("| Where | The paper | Ours, as stated | Ours, nearest reading | Why |\n")[1]
-    return table.split("\n\n")[0].splitlines()[1:]
+HEADING = "| Where | The paper | Ours, as stated | Ours, nearest reading | Verdict | Why |"
+SENTENCES = paper_texts()["sentences"]
 
 
-def test_results__have_every_claim_that_the_code_makes_and_no_other(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(strategies, "process", lambda settings: {name: [spec] for name, spec in SHIPPED_SPECS.items()})
+def escaped(text: str) -> str:
+    return text.replace("H*", r"H\*").replace("a*", r"a\*")
+
+
+def sentences_of(page: str) -> list[list[str]]:
+    """The rows of the table of sentences of a page, as texts."""
+    rows = page.split(f"{HEADING}\n")[1].split("\n\n")[0].splitlines()[1:]
+    return [re.split(r" ?(?<!\\)\| ?", row)[1:-1] for row in rows]
+
+
+def test_results__have_every_sentence_in_the_papers_order() -> None:
+    committed = [row[:2] for row in sentences_of(RESULTS)]
+    assert committed == [[each["where"], escaped(each["paper"])] for each in SENTENCES]
+
+
+def test_results__have_a_number_in_each_row_that_was_run_and_the_reason_for_its_verdict() -> None:
+    for row, sentence in zip(sentences_of(RESULTS), SENTENCES, strict=True):
+        *_, ours, _, verdict, why = row
+        assert re.search(r"\d", ours) or verdict == "not run"
+        assert why == escaped(sentence["why"].get(verdict, "").strip())
+        assert why or verdict in ("agrees", "not run")
+
+
+def test_sentences__are_judged_by_claims_that_the_code_makes_and_no_claim_is_left_out(
+    tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course = Course([{k: -9.0 + min(k, 3) for k in range(9)}] * 2, [{100.0: 1.0}] * 2)
+    courses = dict.fromkeys(SHIPPED_SPECS, course)
+    two_seeds = {name: [spec, spec] for name, spec in SHIPPED_SPECS.items()}
+    monkeypatch.setattr(strategies, "process", lambda settings: two_seeds)
+    for module in (curves, tables, learning):
+        monkeypatch.setattr(
+            module, "courses_of", lambda settings, delay: {"PPO": course} if delay == learning.DENSE else courses
+        )
     for module in (curves, tables):
         monkeypatch.setattr(module, "unconverged_policy", lambda folder: "ppo-obstacle")
     settings = ReproductionSettings(tmp_path, episodes=20)
-    made = [claim for item in ITEMS for claim in item.make(settings).claims]
-    committed = [re.split(r" ?\| ?", row)[1:3] for row in claims_of(RESULTS)]
-    assert committed == [[each.where, each.paper.replace("H*", r"H\*")] for each in made]
+    made = {f"{item.name}/{claim.name}" for item in ITEMS for claim in item.make(settings).claims}
+    assert made == {sentence["result"] for sentence in SENTENCES}
+    verdicts = get_args(Verdict)
+    assert all(verdict in verdicts for sentence in SENTENCES for verdict in sentence["why"])
 
 
 def test_results__are_those_of_this_version_and_the_non_ethical_row_of_today() -> None:
     assert f"version {__version__}, physics {physics_digest()})" in " ".join(RESULTS.split())
     stated, nearest = ({NON_E: report_outcome(NON_E, reading, PAPER_EPISODES)} for reading in (STATED, NEAREST))
-    own = tables.number_claims("Table III", RANDOM_TEST[:1], stated, nearest, 0.0 * stated[NON_E][1])
-    rows = markdown(claims_sheet(own)).splitlines()[2:]
-    assert rows == [row for row in claims_of(RESULTS) if row.startswith(f"| Table III | {NON_E}, ")]
+    claims = tables.number_claims(RANDOM_TEST[:1], stated, nearest, 0.0 * stated[NON_E][1])
+    rows = [row[2:5] for row in sentences_of(RESULTS) if row[1].startswith(f"{NON_E}, ")]
+    assert rows == [[*claim[1:]] for claim in claims]
 
 
 def test_pages__name_every_figure_and_table_of_the_paper() -> None:

@@ -1,18 +1,19 @@
-"""Verdicts: a table by hand for numbers, one for statements, and the one table of claims."""
+"""Verdicts: a table by hand for numbers, one for statements, and the one table of sentences."""
 
 import numpy as np
 import pytest
 
+from ethbrake_marl.extensions.reproduction import verdicts
 from ethbrake_marl.extensions.reproduction.documents import latex, markdown
 from ethbrake_marl.extensions.reproduction.verdicts import (
-    PERCENT,
     Claim,
     Less,
     chance_difference,
-    claims_sheet,
     judge,
     judge_number,
+    judge_share,
     judge_statement,
+    sentences_sheet,
 )
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 
@@ -76,25 +77,41 @@ def test_less__is_paired_in_the_same_worlds() -> None:
     assert Less.of_worlds("w", one * 0.0, other * 0.0).both_are_0 and not Less.of_worlds("w", one, one).both_are_0
 
 
-def test_claims__in_the_one_table() -> None:
-    claims = [
-        judge("Fig. 4", "a is less", [A], [WRONG, D], why="so it is"),
-        judge("Fig. 4", "c is less", [WRONG], why="so it is"),
-        judge("Fig. 5", "b is less", [Less("rates", around(0.25, 0.125))], show=PERCENT),
-        judge("Fig. 6", "nothing", [TIE], why="all are 0"),
-        Claim("Table II", "2,005", "", "", "cannot be", "a|b"),
-        Claim("Fig. 2", "same", "", "", "not run", "needs --full"),
+def test_claim__by_hand() -> None:
+    assert judge("x", [A], [WRONG, D]) == Claim("x", "holds: a, -3.00 [-4.00, -2.00]", "holds in 1 of 2", "agrees")
+    assert judge("x", [WRONG], numbers="1 to 2") == Claim("x", "does not hold: 1 to 2", "", "differs")
+    assert judge("x", [TIE]) == Claim("x", "nothing to compare: both are 0 in all worlds", "", "undecided")
+
+
+@pytest.mark.parametrize(
+    ("holds", "expected"),
+    [
+        ([True, True], ("holds in 100.0 % [34.2, 100.0] of 2 worlds", "", "agrees")),
+        ([True, False], ("holds in 50.0 % [9.5, 90.5] of 2 worlds", "", "differs")),
+        ([], ("", "", "undecided")),
+    ],
+)
+def test_share__agrees_if_it_holds_in_every_world(holds: list[bool], expected: tuple[str, str, str]) -> None:
+    assert judge_share("s", np.array(holds, np.bool_), "worlds")[1:] == expected
+
+
+def test_sentences__are_in_the_papers_order_with_the_reason_for_their_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    sentences = [
+        {"where": "Fig. 4", "paper": "a < b", "result": "two/x", "why": {"differs": "no", "agrees": "so it is"}},
+        {"where": "Fig. 5", "paper": "b|c", "result": "one/y", "why": {}},
+        {"where": "Fig. 2", "paper": "same", "result": "one/z", "why": {"not run": "needs --full"}},
+        {"where": "Fig. 9", "paper": "left out", "result": "three/x", "why": {}},
     ]
-    assert markdown(claims_sheet(claims)).splitlines() == [
-        "| Where | The paper | Ours, as stated | Ours, nearest reading | Why |",
-        "| --- | --- | --- | --- | --- |",
-        "| Fig. 4 | a is less | holds | holds in 1 of 2 | agrees: a, -3.00 [-4.00, -2.00] |",
-        "| Fig. 4 | c is less | does not hold |  | differs because so it is (c, +2.00 [+1.00, +3.00]) |",
-        "| Fig. 5 | b is less | does not hold |  | differs because rates, 25.0 % [12.5, 37.5] |",
-        "| Fig. 6 | nothing | nothing to compare |  | undecided: both are 0 in all worlds |",
-        "| Table II | 2,005 |  |  | cannot be because a\\|b |",
-        "| Fig. 2 | same |  |  | not run: needs --full |",
+    monkeypatch.setattr(verdicts, "paper_texts", lambda: {"sentences": sentences})
+    claims = {"one": {"y": Claim("y", "2", "3", "differs")}, "two": {"x": Claim("x", "1", "", "agrees")}}
+    assert markdown(sentences_sheet(claims)).splitlines() == [
+        "| Where | The paper | Ours, as stated | Ours, nearest reading | Verdict | Why |",
+        "| --- | --- | --- | --- | --- | --- |",
+        "| Fig. 4 | a < b | 1 |  | agrees | so it is |",
+        "| Fig. 5 | b\\|c | 2 | 3 | differs |  |",
+        "| Fig. 2 | same |  |  | not run | needs --full |",
     ]
+    assert [row[-1] for row in sentences_sheet(claims, reasons=False).rows] == ["", "", ""]
 
 
 def test_latex__by_hand() -> None:
