@@ -239,7 +239,7 @@ class Scenario(ScenarioPart):
         no world.
         """
         world_numbers(n, seed, first, purpose)
-        return self.pools[purpose](int(n), int(seed), int(first))
+        return self._pools[purpose](int(n), int(seed), int(first))
 
     def draw(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> DrawnWorlds:
         """The worlds of ``sample``, with the friction, vehicle types, member of the mixture and recording of each.
@@ -249,7 +249,7 @@ class Scenario(ScenarioPart):
         return draw_worlds(self, n, seed, first, purpose)
 
     @cached_property
-    def pools(self) -> dict[Purpose, WorldPool]:
+    def _pools(self) -> dict[Purpose, WorldPool]:
         """Sources of the worlds of ``sample``, for each purpose."""
         return {"list": WorldPool(self, "list"), "training": WorldPool(self, "training")}
 
