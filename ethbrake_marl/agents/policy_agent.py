@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,11 @@ from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
-from ethbrake_marl.episode.observe import View
+from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import NUMBER, State, map_arrays
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.motion.digest import physics_digest
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.manifest import PHYSICS_KEY
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -38,9 +38,15 @@ from ethbrake_marl.worlds.game import AnyScenario, views_of
 from ethbrake_marl.worlds.scenario import Scenario
 
 
+class RangeMemory(NamedTuple):
+    outside: Ints  # [n] number of decisions so far outside the range of the policy's training
+
+
 @dataclass(frozen=True)
 class LearnedAgent(Observer):
     """Drives with the deterministic actions of a policy of this package.
+
+    Outside the range of its training (``policies.training_range``) it follows the policy's fallback, if there is one.
 
     >>> import ethbrake_marl as eb
     >>> eb.LearnedAgent(eb.load_shipped("ppo"), name="mine").name
@@ -77,13 +83,26 @@ class LearnedAgent(Observer):
                 stacklevel=2,
             )
 
-    def begin(self, alert: State, body: int) -> None:
-        """None, because the agent has no memory."""
+    def begin(self, alert: State, body: int) -> RangeMemory | None:
+        """Memory that counts decisions outside the range; None if the policy's range is unknown."""
+        return None if self.policy.manifest.training_range is None else RangeMemory(np.zeros(alert.n, np.int64))
 
-    def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
-        policy, step_s = self.policy, self.policy.manifest.time_step_s
-        observations = observe_through(self.layers, policy.observation, state, body, step_s)
-        return commands_of(state, body, policy(observations)[:, 0].astype(np.float64)), None
+    def act(self, state: State, memory: RangeMemory | None, body: int) -> tuple[Floats, RangeMemory | None]:
+        observations, training_range = (
+            self.observe(self.policy.observation, state, body),
+            self.policy.manifest.training_range,
+        )
+        actions = self.policy(observations)[:, 0].astype(np.float64)
+        if training_range is not None:
+            outside = training_range.is_outside(observations) & ~state.ended
+            if training_range.fallback and outside.any():
+                actions[outside] = self.observe(View([training_range.fallback]), state.take(outside), body)[:, 0]
+            if memory is not None:
+                memory = RangeMemory(memory.outside + outside)
+        return commands_of(state, body, actions), memory
+
+    def observe(self, view: View, state: State, body: int) -> Observations:
+        return observe_through(self.layers, view, state, body, self.policy.manifest.time_step_s)
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,20 @@
-"""The command ``agent list``."""
+"""The commands ``agent list`` and ``agent show``."""
 
 from __future__ import annotations
+
+from typing import Annotated
 
 import typer
 
 from ethbrake_marl.cli.command import JsonOption, Out, example
-from ethbrake_marl.files.sheet import Sheet
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.sheet import Column, Sheet
 
-agent_group = typer.Typer(help="List the agents.", epilog=example("agent list", "agent list --json"))
+SHOWN_EPISODES = 200
+
+agent_group = typer.Typer(
+    help="List the agents, or show a trained one.", epilog=example("agent list", "agent list --json")
+)
 
 
 @agent_group.command("list", epilog=example("agent list"))
@@ -29,3 +36,42 @@ def agent_list(as_json: JsonOption = False) -> None:
         )
         for reason in why_not_listed():
             out.note(f"left out: {reason}")
+
+
+@agent_group.command("show", epilog=example("agent show universal", "agent show ppo --scenario cooperation-3-five"))
+def agent_show(
+    name: Annotated[str, typer.Argument(metavar="AGENT", help="A trained policy, such as universal or policy@PATH.")],
+    scenario: Annotated[
+        str | None, typer.Option(metavar="NAME|PATH", help="Also say how well the policy's training covers a scenario.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show where a policy was trained, and the range of what it observed there."""
+    with Out(as_json=as_json) as out:
+        from ethbrake_marl.agents.policy_agent import LearnedAgent
+        from ethbrake_marl.evaluation.door import evaluate
+        from ethbrake_marl.names import make_agent
+
+        agent = make_agent(name)
+        if not isinstance(agent, LearnedAgent):
+            raise InvalidInput(f"agent {name!r}: is no trained policy; name one, such as universal or policy@runs/mine")
+        manifest, observed = agent.policy.manifest, agent.policy.manifest.training_range
+        lines = [f"{name}: trained by {manifest.algorithm} in {manifest.where_trained}."]
+        rows = []
+        if observed is None:
+            lines.append("The range of its observations in training is not recorded.")
+        else:
+            ends = zip(agent.policy.observation.features, observed.low, observed.high, strict=True)
+            rows = [(f.name, f.scale * low, f.scale * high, f.unit) for f, low, high in ends]
+            if observed.fallback:
+                lines.append(f"Outside the range of its training it follows {observed.fallback}.")
+            if scenario is not None:
+                share = float(evaluate(scenario, name, episodes=SHOWN_EPISODES)[name]["outside"].mean())
+                lines.append(f"In {scenario}, {100 * share:.0f} % of its decisions are outside.")
+        headings = ("feature", "from", "to", "unit")
+        content = {"agent": name, "about": lines, "range": [dict(zip(headings, row, strict=True)) for row in rows]}
+        out.result(
+            content,
+            " ".join(lines),
+            Sheet("", ("Feature", Column("From", "from"), Column("To", "to"), "Unit"), rows, gap=2),
+        )

@@ -15,7 +15,7 @@ from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.captions import caption, ranges_of
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, Measure, MeasureValues, Statistic
-from ethbrake_marl.evaluation.summary_row import EXPLOITS, SEES_THROUGH, SummaryRow
+from ethbrake_marl.evaluation.summary_row import EXPLOITS, OUTSIDE_SHARE, SEES_THROUGH, SummaryRow
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, flat_row, terminal_text
 
 BASELINE = "full_brake"
@@ -101,7 +101,7 @@ class SummaryTable(list[SummaryRow]):
         return [self.terminal(), *filter(None, [self.measures()])]
 
     def notes(self) -> list[str]:
-        """Warnings for a reader: rejected worlds, exploits, hidden values."""
+        """Warnings for a reader: rejected worlds, exploits, policies outside their training, hidden values."""
         notes, rejected = [], self.parameters.get("rejected_draws", 0)
         if rejected:
             draws = rejected + self.parameters["count"]
@@ -113,6 +113,12 @@ class SummaryTable(list[SummaryRow]):
         exploits = [f"{row.agent} {' and '.join(row.exploits.values())}" for row in self if row.exploits]
         if exploits:
             notes.append(f"{EXPLOITS} Harm does not count this: {'; '.join(exploits)} (docs/train.md).")
+        elsewhere = [f"{row.agent} in {100 * row.outside:.0f} %" for row in self if row.outside > OUTSIDE_SHARE]
+        if elsewhere:
+            notes.append(
+                "Share of decisions with observations outside the range of the policy's training:"
+                f" {'; '.join(elsewhere)}. There a policy may be worse than full braking (docs/reference/policies.md)."
+            )
         through = [row.agent for row in self if row.sees_through]
         if through:
             notes.append(
