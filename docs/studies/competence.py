@@ -27,7 +27,7 @@ from ethbrake_marl.training.training_range import with_ranges
 POLICY, FALLBACK = "universal", "plan.action"
 RECORDED_WORLDS, RECORDED_SEED = 4_000, 1007  # the seed is for bundles without a fixed list
 WORLDS, SEED, LINES_SEED = 300, 96_001, 96_002
-RULES = (2, 3, 4, 6)  # features outside
+RULES = ((2, 0.0), (2, 0.05), (3, 0.0), (3, 0.05), (4, 0.0), (4, 0.05))  # features outside, margin
 AGENTS = {name: name for name in ("full_brake", "e_v2x_bm", "plan")}
 MORE, MORE_COST = 1.02, 0.05  # an agent is worse if its cost is above the other's by this factor, and this cost (m2/s2)
 
@@ -72,11 +72,15 @@ def lines() -> dict[str, eb.Scenario]:
         "build-up": {"brake_rate_mps3": 15, "release_rate_mps3": 15},
         "slightly other": {"gaps_m": {"uniform": [4.5, 11]}, "mass_t": [4.4, 5.6, 6.1], "latency_s": [0, 0.45, 0.85]},
     }  # fmt: skip
-    return named | {name: line(3, 2, **change) for name, change in changes.items()}
+    named |= {name: line(3, 2, **change) for name, change in changes.items()}
+    for place in ((3, 2), (3, 3), (4, 2), (5, 3)):
+        for name, key, ends in (("near", "obstacle_margin_m", [1, 8]), ("far", "obstacle_gap_m", [38, 55])):
+            named[f"{':'.join(map(str, place))}, {name} obstacle"] = line(*place, **{key: {"uniform": ends}})
+    return named
 
 
 def costs(scenario: eb.Scenario, agents: Any, seed: int) -> dict[str, float]:
-    """Honest cost of each agent, its share of decisions outside (``NAME outside``), and whether messages hide a value."""
+    """Honest cost of each agent, its share of decisions outside (``NAME outside``), and the share of hidden worlds."""
     result = eb.evaluate(scenario, agents, episodes=WORLDS, seed=seed, harm_count="honest")
     ranged = [agent for agent in result if "outside" in result[agent]]
     means = {agent: float(result[agent]["honest_cost"].mean()) for agent in result}
@@ -104,13 +108,15 @@ def quality(rows: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def rule() -> None:
-    scenarios = lines()
-    for features in RULES:
-        training_range.FEATURES_OUTSIDE = features
-        agents = {**AGENTS, "alone": alone(), POLICY: POLICY}
-        rows = {name: costs(scenario, agents, LINES_SEED) for name, scenario in scenarios.items()}
+    known = {name: costs(scenario, AGENTS, LINES_SEED) for name, scenario in lines().items()}
+    for features, margin in RULES:
+        training_range.FEATURES_OUTSIDE, training_range.MARGIN = features, margin
+        agents = {"alone": alone(), POLICY: POLICY}
+        rows = {name: known[name] | costs(scenario, agents, LINES_SEED) for name, scenario in lines().items()}
         ratio = np.exp(np.mean([np.log(row[POLICY] / row["plan"]) for row in rows.values()]))
-        print(f"{features} features: {quality(rows)}; {POLICY} / plan, geometric mean: {ratio:.3f}", flush=True)
+        print(
+            f"{features} features by {margin}: {quality(rows)}; {POLICY} / plan, geometric mean {ratio:.3f}", flush=True
+        )
 
 
 def table() -> None:

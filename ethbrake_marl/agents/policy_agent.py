@@ -88,10 +88,8 @@ class LearnedAgent(Observer):
         return None if self.policy.manifest.training_range is None else RangeMemory(np.zeros(alert.n, np.int64))
 
     def act(self, state: State, memory: RangeMemory | None, body: int) -> tuple[Floats, RangeMemory | None]:
-        observations, training_range = (
-            self.observe(self.policy.observation, state, body),
-            self.policy.manifest.training_range,
-        )
+        training_range = self.policy.manifest.training_range
+        observations = self.observe(self.policy.observation, state, body)
         actions = self.policy(observations)[:, 0].astype(np.float64)
         if training_range is not None:
             outside = training_range.is_outside(observations) & ~state.ended

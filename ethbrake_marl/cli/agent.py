@@ -38,7 +38,7 @@ def agent_list(as_json: JsonOption = False) -> None:
             out.note(f"left out: {reason}")
 
 
-@agent_group.command("show", epilog=example("agent show universal", "agent show ppo --scenario cooperation-3-five"))
+@agent_group.command("show", epilog=example("agent show universal --scenario stress-wide"))
 def agent_show(
     name: Annotated[str, typer.Argument(metavar="AGENT", help="A trained policy, such as universal or policy@PATH.")],
     scenario: Annotated[
@@ -46,7 +46,10 @@ def agent_show(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show where a policy was trained, and the range of what it observed there."""
+    """Show where a policy was trained.
+
+    The table has the range of what the policy observed there, without the outermost 0.1 % at each end.
+    """
     with Out(as_json=as_json) as out:
         from ethbrake_marl.agents.policy_agent import LearnedAgent
         from ethbrake_marl.evaluation.door import evaluate

@@ -70,7 +70,7 @@ class Manifest(FiniteModel):
         lines: list[Any] = [member["scenario"] for member in mixture] or [self.scenario]
         vehicles = {str(line.get("vehicles", "?")) for line in lines}
         brakes = {"that build up" if line.get("brake_rate_mps3") else "at once" for line in lines}
-        messages = {str(line.get("v2x", {}).get("preset", "?")) for line in lines}
+        messages = {str(line.get("v2x", {}).get("preset", "paper")) for line in lines}
         return (
             f"{self.scenario.get('name')}: {', '.join(self.learners)} of {'/'.join(sorted(vehicles))} vehicles, brakes"
             f" {'/'.join(sorted(brakes))}, messages {'/'.join(sorted(messages))}"

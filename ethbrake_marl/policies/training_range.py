@@ -13,7 +13,8 @@ from ethbrake_marl.motion.layout import Bools
 from ethbrake_marl.policies.observed import FiniteModel
 
 OUTER_SHARE = 0.001  # share of the observed values below the range, and above it
-FEATURES_OUTSIDE = 3  # an observation is outside if so many of its features are (docs/train.md)
+FEATURES_OUTSIDE = 3  # an observation is outside if so many of its features are, each by more than MARGIN
+MARGIN = 0.05  # as observed: 5 % of the feature's scale
 
 Ends = Annotated[tuple[float, ...], Field(min_length=1, max_length=4096)]  # [F], as observed, scaled
 
@@ -42,5 +43,6 @@ class TrainingRange(FiniteModel):
 
     def is_outside(self, observations: Observations) -> Bools:
         """Whether each observation is outside, [n]; ``observations`` [n, F]."""
-        low, high = np.float32(self.low), np.float32(self.high)
-        return ((observations < low) | (observations > high)).sum(axis=1) >= FEATURES_OUTSIDE
+        low, high = (np.array(ends, np.float32) for ends in (self.low, self.high))
+        beyond = (observations < low - MARGIN) | (observations > high + MARGIN)
+        return np.asarray(beyond.sum(axis=1) >= FEATURES_OUTSIDE)
