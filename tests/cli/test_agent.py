@@ -8,7 +8,7 @@ from tests.fixtures.commands import Command, check_refused, told_json
 
 
 def test_show__has_the_training_and_the_range_in_units(ethbrake: Command) -> None:
-    content = told_json(ethbrake(*"agent show ppo --scenario cooperation-3-five --json".split()))
+    content = told_json(ethbrake(*["agent", "show", "ppo", "--scenario", "cooperation-3-five", "--json"]))
     assert content["about"] == [
         "ppo: trained by ppo in paper-random: vehicle_2 of 3 vehicles, brakes at once, messages paper.",
         "In cooperation-3-five, 71 % of its decisions are outside.",
@@ -21,4 +21,6 @@ def test_show__has_the_training_and_the_range_in_units(ethbrake: Command) -> Non
 
 
 def test_show__is_for_trained_policies(ethbrake: Command) -> None:
-    check_refused(ethbrake("agent", "show", "coast"), "agent 'coast': is no trained policy; name one, such as universal")
+    check_refused(
+        ethbrake("agent", "show", "coast"), "agent 'coast': is no trained policy; name one, such as universal"
+    )
