@@ -58,23 +58,22 @@ def agent_show(
         agent = make_agent(name)
         if not isinstance(agent, LearnedAgent):
             raise InvalidInput(f"agent {name!r}: is no trained policy; name one, such as universal or policy@runs/mine")
-        manifest, observed = agent.policy.manifest, agent.policy.manifest.training_range
-        lines = [f"{name}: trained by {manifest.algorithm} in {manifest.where_trained}."]
-        rows = []
-        if observed is None:
-            lines.append("The range of its observations in training is not recorded.")
-        else:
-            ends = zip(agent.policy.observation.features, observed.low, observed.high, strict=True)
-            rows = [(f.name, f.scale * low, f.scale * high, f.unit) for f, low, high in ends]
-            if observed.fallback:
-                lines.append(f"Outside the range of its training it follows {observed.fallback}.")
-            if scenario is not None:
-                share = float(evaluate(scenario, name, episodes=SHOWN_EPISODES)[name]["outside"].mean())
-                lines.append(f"In {scenario}, {100 * share:.0f} % of its decisions are outside.")
-        headings = ("feature", "from", "to", "unit")
-        content = {"agent": name, "about": lines, "range": [dict(zip(headings, row, strict=True)) for row in rows]}
-        out.result(
-            content,
-            " ".join(lines),
-            Sheet("", ("Feature", Column("From", "from"), Column("To", "to"), "Unit"), rows, gap=2),
+        manifest = agent.policy.manifest
+        known = manifest.training_range
+        if known is None:
+            raise InvalidInput(f"agent {name!r}: its file does not say what it observed in training; train it again")
+        text = f"{name}: {', '.join(manifest.learners)} in {manifest.scenario.get('name')}, by {manifest.algorithm}."
+        if known.fallback:
+            text += f" Outside the range of its training it follows {known.fallback}."
+        if scenario is not None:
+            share = float(evaluate(scenario, name, episodes=SHOWN_EPISODES)[name]["outside"].mean())
+            text += f" In {scenario}, {100 * share:.0f} % of its decisions are outside."
+        ends = zip(agent.policy.observation.features, known.low, known.high, strict=True)
+        columns = (
+            Column("Feature", "feature", text=True),
+            Column("From", "from"),
+            Column("To", "to"),
+            Column("Unit", "unit", text=True),
         )
+        sheet = Sheet("", columns, [(f.name, f.scale * low, f.scale * high, f.unit) for f, low, high in ends], gap=2)
+        out.result({"about": text, "range": sheet.json()}, text, sheet)

@@ -63,19 +63,6 @@ class Manifest(FiniteModel):
         is_valid = isinstance(step, int | float) and not isinstance(step, bool) and 0.0 < step <= LONGEST_STEP_S
         return float(step) if is_valid else math.nan  # type: ignore[arg-type]  # a number
 
-    @property
-    def where_trained(self) -> str:
-        """Scenario, controlled vehicles, number of vehicles, brakes and messages of the training, in words."""
-        mixture: Any = self.scenario.get("mixture") or ()
-        lines: list[Any] = [member["scenario"] for member in mixture] or [self.scenario]
-        vehicles = {str(line.get("vehicles", "?")) for line in lines}
-        brakes = {"that build up" if line.get("brake_rate_mps3") else "at once" for line in lines}
-        messages = {str(line.get("v2x", {}).get("preset", "paper")) for line in lines}
-        return (
-            f"{self.scenario.get('name')}: {', '.join(self.learners)} of {'/'.join(sorted(vehicles))} vehicles, brakes"
-            f" {'/'.join(sorted(brakes))}, messages {'/'.join(sorted(messages))}"
-        )
-
     @model_validator(mode="after")
     def _parts_fit(self) -> Manifest:
         network, features = self.network, self.observation.features

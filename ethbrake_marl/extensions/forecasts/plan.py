@@ -24,7 +24,14 @@ from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import TIME, State, check_exact
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.extensions.forecasts.contacts import FORECAST_S, PER_SIDE, impact_features, known_line, write_impacts
+from ethbrake_marl.extensions.forecasts.contacts import (
+    FORECAST_S,
+    PER_SIDE,
+    SIDES,
+    impact_features,
+    known_line,
+    write_impacts,
+)
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacity
 from ethbrake_marl.motion.interval import EVENT_BY_EVENT, FAILED, move_line
@@ -53,21 +60,21 @@ def _of_command(command: str, held: str) -> list[Feature]:
     return [*impact_features(command, held), cost]
 
 
-def _of_brakes(vehicle: str, whose: str) -> list[Feature]:
-    return [
-        Feature(f"{vehicle}_build_up_time", "s", 1.0, 0.0, 4.0, f"time until {whose} brakes are fully applied"),
-        Feature(f"{vehicle}_release_time", "s", 1.0, 0.0, 4.0, f"time until {whose} full brakes are released"),
-    ]
-
-
 PLAN = (
     Feature("action", "1", 1.0, -1.0, 0.0, "constant braking of least forecast honest cost; -1 is full braking"),
     *(feature for command, held in COMMANDS.items() for feature in _of_command(command, held)),
-    *_of_brakes("own", "own"),
-    *_of_brakes("front", "the brakes of the vehicle ahead: its"),
-    *_of_brakes("rear", "the brakes of the vehicle behind: its"),
-    Feature("known_ahead", "1", 1.0, 0.0, 8.0, "number of known vehicles ahead without a gap between them"),
-    Feature("known_behind", "1", 1.0, 0.0, 8.0, "number of known vehicles behind without a gap between them"),
+    *(
+        Feature(
+            f"{vehicle}_{change}_time",
+            "s",
+            1.0,
+            0.0,
+            4.0,
+            f"time until full brakes {change.replace('_', ' ')}: {whose}",
+        )
+        for vehicle, whose in {"own": "own", **SIDES}.items()
+        for change in ("build_up", "release")
+    ),
 )
 
 
@@ -112,11 +119,9 @@ def plan_worlds(line, car, clock, know, observers, time_step_s, weights, memory,
             value[0], f = middle, 1 + 3 * PER_COMMAND
             for j in (i, i - 1, i + 1):
                 is_known = max(first, 1) <= j <= last
-                braking = capacity(car[k], BRAKING, j, time) if is_known else 0.0
-                value[f] = braking / car[k, BRAKE_RATE, j] if is_known else 0.0
-                value[f + 1] = braking / car[k, RELEASE_RATE, j] if is_known else 0.0
-                f += 2
-            value[f], value[f + 1] = i - max(first, 1), last - i
+                for rate in (BRAKE_RATE, RELEASE_RATE):
+                    value[f] = capacity(car[k], BRAKING, j, time) / car[k, rate, j] if is_known else 0.0
+                    f += 1
     return failed
 
 

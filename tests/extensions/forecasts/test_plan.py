@@ -71,7 +71,7 @@ def test_plan__by_hand() -> None:
     assert plan["coast_front_time"] == pytest.approx(math.sqrt(15.0), abs=1e-4)
     assert plan["coast_front_closing_speed"] == pytest.approx(4.0 * math.sqrt(15.0), abs=1e-4)
     assert (plan["own_build_up_time"], plan["own_release_time"], plan["front_build_up_time"]) == (0.5, 0.0, 0.0)
-    assert (plan["known_ahead"], plan["known_behind"], plan["coast_rear_time"]) == (1.0, 0.0, 0.0)
+    assert plan["coast_rear_time"] == plan["rear_build_up_time"] == 0.0  # nobody is behind
 
 
 def test_who_is_not_known__is_not_planned_for() -> None:
@@ -83,7 +83,7 @@ def test_who_is_not_known__is_not_planned_for() -> None:
     line[unknown, at.SPEED, 3] = 39.0
     views = [PLAN.observe(s, np.array([2]), 0.1)[unknown] for s in (state, state._replace(line=line))]
     assert views[0].tobytes() == views[1].tobytes()
-    assert (plan_of(state, 2)["known_behind"] == ~unknown).all()
+    assert ((plan_of(state, 2)["coast_rear_time"] == 0.0) == unknown).all()
 
 
 def test_agent__follows_the_plan_anew_at_every_decision() -> None:
