@@ -184,6 +184,6 @@ GROUP = Part(PLAN, _plans)
 AGENT = Part(
     make_plan,
     form="plan",
-    about="at every decision anew, the constant braking of least forecast honest cost for the vehicles that are known",
+    about="at every decision, the constant braking of least forecast honest cost",
     knows=MESSAGES,
 )
