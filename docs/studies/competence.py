@@ -22,7 +22,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.evaluation.summary_row import OUTSIDE_SHARE
 from ethbrake_marl.policies import training_range
 from ethbrake_marl.policies.bundle import load_shipped, shipped_policies
-from ethbrake_marl.training.training_range import with_ranges
+from ethbrake_marl.training.training_range import record_ranges
 
 POLICY, FALLBACK = "universal", "plan.action"
 RECORDED_WORLDS, RECORDED_SEED = 4_000, 1007  # the seed is for bundles without a fixed list
@@ -36,7 +36,7 @@ def record() -> None:
     for name, folder in shipped_policies().items():
         policy = load_shipped(name)
         manifest = policy.manifest
-        ranged = with_ranges(
+        ranged = record_ranges(
             dict.fromkeys(manifest.learners, policy), str(manifest.scenario["name"]), RECORDED_WORLDS,
             manifest.seeds.get("evaluation", RECORDED_SEED), FALLBACK if name == POLICY else "",
         )  # fmt: skip

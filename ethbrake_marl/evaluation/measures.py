@@ -180,8 +180,9 @@ def outside(game: Game, alert: State, last: State) -> MeasureValue:
     their mean. Defined if every learner has such a policy.
     """
     shield: Any = last.memories.get("shield")
-    unshielded = [last.memories.get(body) for body in game.settings.learners.tolist()]
-    memories: list[Any] = list(getattr(shield, "agents", unshielded))
+    memories: Any = [last.memories.get(body) for body in game.settings.learners.tolist()]
+    if shield is not None:
+        memories = getattr(shield, "agents", [getattr(shield, "agent", None)])
     if not memories or not all(hasattr(memory, "outside") for memory in memories):
         return None
     return np.asarray(np.mean([memory.outside for memory in memories], axis=0) / np.maximum(last.steps, 1))

@@ -10,10 +10,19 @@ from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.training_range import TrainingRange
 from ethbrake_marl.training.fixed_list import Policies
+from ethbrake_marl.training.training import Training
 from ethbrake_marl.worlds.game import AnyScenario
 
+MOST_WORLDS = 1_000  # of the fixed list that are driven
 
-def with_ranges(policies: Policies, scenario: AnyScenario, worlds: int, seed: int, fallback: str = "") -> Policies:
+
+def with_ranges(policies: Policies, training: Training) -> Policies:
+    """The policies, each with the range of what it observes in the fixed list of the training."""
+    listed = training.recipe.evaluation
+    return record_ranges(policies, training.scenario, min(listed.worlds, MOST_WORLDS), listed.seed) if policies else {}
+
+
+def record_ranges(policies: Policies, scenario: AnyScenario, worlds: int, seed: int, fallback: str = "") -> Policies:
     """The policies (learner -> policy), each with the range of what it observes in ``worlds`` worlds of ``scenario``.
 
     Learners that share a policy share its range. ``fallback``: as in ``TrainingRange``.

@@ -201,14 +201,10 @@ class BetweenUpdates(BaseCallback):
 
         After an error, ``reason``, the ranges are left out: to record them, the policies must drive.
         """
-        listed = self.training.recipe.evaluation
         if self.weights:
             self.make_policies()
         if reason is None:
-            self.policies, self.best = (
-                with_ranges(policies, self.training.scenario, listed.worlds, listed.seed) if policies else policies
-                for policies in (self.policies, self.best)
-            )
+            self.policies, self.best = with_ranges(self.policies, self.training), with_ranges(self.best, self.training)
         for policies, place in ((self.chosen, self.folder.policy), (self.policies, self.folder.last_policy)):
             if policies:
                 save_drivers(policies, place, replace=True)

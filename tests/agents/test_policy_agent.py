@@ -27,6 +27,7 @@ from ethbrake_marl.agents.team import Agent, Team, play_to_end
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar
+from ethbrake_marl.evaluation.door import evaluate
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
@@ -34,6 +35,7 @@ from ethbrake_marl.motion.layout import BRAKING, DRIVING
 from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.policies.training_range import TrainingRange
+from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from ethbrake_marl.shields.step import StepShield
 from tests.refused import refused
 
@@ -121,6 +123,9 @@ def test_learned_agent__counts_decisions_outside_its_range_also_behind_a_shield(
         assert (last.memories[2].outside == share * last.steps).all() and last.steps.min() > 5
         shielded = play_to_end(GAME, WORLDS, Team("mine", {2: agent}, StepShield({2: agent})))
         assert (shielded.memories["shield"].agents[0].outside == share * shielded.steps).all()
+        for shield in (None, StepShield({2: agent}), EpisodeShield({2: agent})):
+            result = evaluate(WORLDS, {"mine": Team("mine", {2: agent}, shield)}, scenario=PAPER)
+            assert (result["mine"]["outside"] == share).all()
     assert harms(ranged(0.0)) == harms(LearnedAgent(PPO.with_range(None)))
 
 

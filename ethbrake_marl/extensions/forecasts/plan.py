@@ -1,10 +1,11 @@
 """The feature group ``plan``, and the agent of this name: the best constant braking for the vehicles that are known.
 
-At every decision, eight constant brakings from coasting to full braking are simulated in the forecast of ``contacts``.
-The plan is the one of least honest cost of the known pairs. The agent applies it until the next decision, and plans
-anew: receding-horizon control with constant commands. Its objective, the least impact energy of a line, is that of
-coordinated brake control (Lu, Wang, Li and Zheng, Mathematical Problems in Engineering 2014, article 192175; Wang, Li,
-Zheng and Lu, Integrated Computer-Aided Engineering 22, 2015, pages 171-185).
+At every decision, nine constant brakings from full braking to coasting are simulated in the forecast of ``contacts``,
+and then nine between the neighbours of the best. The plan is the one of least honest cost of the known pairs; of equal
+ones, the middle one. The agent applies it until the next decision, and plans anew: receding-horizon control with
+constant commands. Its objective, the least impact energy of a line, is that of coordinated brake control (Lu, Wang, Li
+and Zheng, Mathematical Problems in Engineering 2014, article 192175; Wang, Li, Zheng and Lu, Integrated Computer-Aided
+Engineering 22, 2015, pages 171-185).
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from ethbrake_marl.motion.layout import (
 )
 from ethbrake_marl.registry import Part
 
-TRIALS, LEVELS = 9, 2  # brakings of one search, and searches: from -1 to 0, then between the neighbours of the best
+TRIALS, LEVELS = 9, 2  # brakings of one search, and searches
 STEP_S = 0.1  # decision step of impact features, on which actions do not depend
 SAME_COST = 1e-6  # costs that differ by less are equal (m2/s2)
 COMMANDS = {"best": "the plan", "brake": "full braking", "coast": "coasting"}
@@ -64,15 +65,8 @@ PLAN = (
     Feature("action", "1", 1.0, -1.0, 0.0, "constant braking of least forecast honest cost; -1 is full braking"),
     *(feature for command, held in COMMANDS.items() for feature in _of_command(command, held)),
     *(
-        Feature(
-            f"{vehicle}_{change}_time",
-            "s",
-            1.0,
-            0.0,
-            4.0,
-            f"time until full brakes {change.replace('_', ' ')}: {whose}",
-        )
-        for vehicle, whose in {"own": "own", **SIDES}.items()
+        Feature(f"{vehicle}_{change}_time", "s", 1.0, 0.0, 4.0, f"time for a full {change} of the brakes of {whose}")
+        for vehicle, whose in {"own": "this vehicle", **SIDES}.items()
         for change in ("build_up", "release")
     ),
 )
