@@ -18,11 +18,9 @@ def test_show__has_the_training_and_the_range_in_units(ethbrake: Command) -> Non
     ranges = {row.pop("feature"): row for row in content["range"]}
     assert ranges["own.braking_capacity"] == {"from": pytest.approx(7.0), "to": pytest.approx(7.0), "unit": "m/s2"}
     assert -0.5 < ranges["own.speed"]["from"] <= 0.1 and 20.0 < ranges["own.speed"]["to"] < 23.0
-    table = ethbrake("agent", "show", "universal").out
-    assert table.startswith(
-        "universal: vehicle_2 in mixture-three-tests, by vine. Outside the range of its training it"
-    )
-    assert "it follows plan.action." in table and "own.braking_capacity" in table and "7.00" in table
+    table = ethbrake("agent", "show", "ppo").out
+    assert table.startswith("ppo: vehicle_2 in paper-random, by ppo.")
+    assert "own.braking_capacity" in table and "7.00" in table
 
 
 def test_show__is_for_trained_policies_that_have_a_range(ethbrake: Command, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import CorruptBundle
-from ethbrake_marl.policies.bundle import load_policy, load_shipped, shipped_policies
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.training_range import TrainingRange
 from tests.policies.test_bundles import make_policy
 from tests.refused import refused
@@ -59,11 +59,3 @@ def test_bad_range__is_refused(change: dict[str, Any], text: str, tmp_path: Path
     policy.with_range(TrainingRange.model_construct(**change)).save(tmp_path / "a")
     with refused(text, CorruptBundle):
         load_policy(tmp_path / "a")
-
-
-def test_shipped_policies__all_have_a_range_and_universal_a_fallback() -> None:
-    ranges = {name: load_shipped(name).manifest.training_range for name in shipped_policies()}
-    assert {name: known and known.fallback for name, known in ranges.items() if name == "universal"} == {
-        "universal": "plan.action"
-    }
-    assert all(known is not None for known in ranges.values())
