@@ -15,7 +15,7 @@ from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.captions import caption, ranges_of
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, Measure, MeasureValues, Statistic
-from ethbrake_marl.evaluation.summary_row import EXPLOITS, OUTSIDE_SHARE, SEES_THROUGH, SummaryRow
+from ethbrake_marl.evaluation.summary_row import EXPLOITS, SEES_THROUGH, SummaryRow
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, flat_row, terminal_text
 
 BASELINE = "full_brake"
@@ -113,7 +113,7 @@ class SummaryTable(list[SummaryRow]):
         exploits = [f"{row.agent} {' and '.join(row.exploits.values())}" for row in self if row.exploits]
         if exploits:
             notes.append(f"{EXPLOITS} Harm does not count this: {'; '.join(exploits)} (docs/train.md).")
-        elsewhere = [f"{row.agent} in {100 * row.outside:.0f} %" for row in self if row.outside > OUTSIDE_SHARE]
+        elsewhere = [f"{row.agent} in {100 * row.outside:.0f} %" for row in self if row.is_elsewhere]
         if elsewhere:
             notes.append(
                 "Share of decisions with observations outside the range of the policy's training:"
@@ -287,4 +287,7 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
         "Passed: no vehicle collides in any world. Harm: mean per world in m²/s². Hardest: largest closing speed of any"
         " first impact."
     )
+    elsewhere = [f"{row.agent} in {name}" for name, table in tables.items() for row in table if row.is_elsewhere]
+    if elsewhere:
+        note += f" More than 10 % of its decisions are outside the range of its training: {', '.join(elsewhere)}."
     return Sheet("", columns, rows, note)

@@ -53,6 +53,10 @@ class SummaryRow:
         return 0.0 if share is None else share.value
 
     @property
+    def is_elsewhere(self) -> bool:
+        return self.outside > OUTSIDE_SHARE
+
+    @property
     def exploits(self) -> dict[str, str]:
         """Conduct of the team that harm does not count: name -> size in words.
 

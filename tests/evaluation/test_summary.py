@@ -64,6 +64,9 @@ def test_policy_outside_its_training__is_told_in_one_line() -> None:
     assert not any("outside" in note for note in summarise(at_home).notes()) and share > 0.3
     assert [note for note in notes if f"range of the policy's training: ppo in {100 * share:.0f} %." in note]
     assert summarise(elsewhere).to_json()[1]["outside"] == pytest.approx(share)
+    results = {"home": at_home, "pair": elsewhere}
+    sheet = summarise_lists({name: summarise(result) for name, result in results.items()}, results)
+    assert sheet.note.endswith("outside the range of its training: ppo in pair.")
 
 
 def test_baseline__can_be_another_or_missing(result: Result) -> None:
