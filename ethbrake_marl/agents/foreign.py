@@ -10,11 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.errors import InvalidInput, describe_error, naming_extras
+from ethbrake_marl.files.model import first_mistake
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.training_range import TrainingRange
 
 MOST_ONNX_BYTES = 1 << 31
 
@@ -141,6 +144,23 @@ def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
         feature_list = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
         return tuple(feature_list.split(",")) if feature_list else None
     return getattr(getattr(policy, "observation_space", None), "features", None)
+
+
+def range_of(policy: Any, ask: Ask, features: int, who: str) -> TrainingRange | None:
+    """Range of training that an ONNX model records, or None.
+
+    Raises ``InvalidInput``, with a message that begins with ``who``, if the range does not fit the F ``features``.
+    """
+    text = session_of(policy).get_modelmeta().custom_metadata_map.get("training_range") if ask is ask_onnx else None
+    if text is None:
+        return None
+    try:
+        known = TrainingRange.model_validate_json(text)
+    except ValidationError as error:
+        raise InvalidInput(f"{who}: training_range in the model's metadata: {first_mistake(error)}") from None
+    if len(known.low) != features:
+        raise InvalidInput(f"{who}: training_range in the model's metadata must have {features} features")
+    return known
 
 
 def count_of_actions(policy: Any, count: int | None, who: str) -> int | None:

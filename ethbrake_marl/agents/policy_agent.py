@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,25 +21,57 @@ from ethbrake_marl.agents.foreign import (
     count_of_actions,
     features_of,
     onnx_file,
+    range_of,
 )
 from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
-from ethbrake_marl.episode.observe import View
+from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import NUMBER, State, map_arrays
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.motion.digest import physics_digest
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.manifest import PHYSICS_KEY
 from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.training_range import TrainingRange
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario, views_of
 from ethbrake_marl.worlds.scenario import Scenario
 
 
+class RangeMemory(NamedTuple):
+    outside: Ints  # [n] number of decisions so far outside the range of the policy's training
+
+
+class RangedAgent(Observer):
+    """Base class of agents with a policy: outside the range of its training they follow its fallback, if it has one."""
+
+    def known_range(self) -> TrainingRange | None:
+        raise NotImplementedError
+
+    def observe(self, view: View, state: State, body: int) -> Observations:
+        raise NotImplementedError
+
+    def begin_range(self, n: int) -> RangeMemory | None:
+        """Memory that counts decisions outside the range; None if the range is unknown."""
+        return None if self.known_range() is None else RangeMemory(np.zeros(n, np.int64))
+
+    def in_range(
+        self, observations: Observations, actions: Floats, state: State, memory: RangeMemory | None, body: int
+    ) -> tuple[Floats, RangeMemory | None]:
+        """The policy's ``actions`` [n], or the fallback's where ``observations`` [n, F] are outside; the new memory."""
+        known = self.known_range()
+        if known is None:
+            return actions, memory
+        outside = known.is_outside(observations) & ~state.ended
+        if known.fallback and outside.any():
+            actions[outside] = self.observe(View([known.fallback]), state.take(outside), body)[:, 0]
+        return actions, None if memory is None else RangeMemory(memory.outside + outside)
+
+
 @dataclass(frozen=True)
-class LearnedAgent(Observer):
+class LearnedAgent(RangedAgent):
     """Drives with the deterministic actions of a policy of this package.
 
     >>> import ethbrake_marl as eb
@@ -77,17 +109,24 @@ class LearnedAgent(Observer):
                 stacklevel=2,
             )
 
-    def begin(self, alert: State, body: int) -> None:
-        """None, because the agent has no memory."""
+    def begin(self, alert: State, body: int) -> RangeMemory | None:
+        return self.begin_range(alert.n)
 
-    def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
-        policy, step_s = self.policy, self.policy.manifest.time_step_s
-        observations = observe_through(self.layers, policy.observation, state, body, step_s)
-        return commands_of(state, body, policy(observations)[:, 0].astype(np.float64)), None
+    def act(self, state: State, memory: RangeMemory | None, body: int) -> tuple[Floats, RangeMemory | None]:
+        observations = self.observe(self.policy.observation, state, body)
+        actions = self.policy(observations)[:, 0].astype(np.float64)
+        actions, memory = self.in_range(observations, actions, state, memory, body)
+        return commands_of(state, body, actions), memory
+
+    def known_range(self) -> TrainingRange | None:
+        return self.policy.manifest.training_range
+
+    def observe(self, view: View, state: State, body: int) -> Observations:
+        return observe_through(self.layers, view, state, body, self.policy.manifest.time_step_s)
 
 
 @dataclass(frozen=True)
-class PolicyAgent(Observer):
+class PolicyAgent(RangedAgent):
     """Drives with a policy of another library; made by ``policy_agent``. It can be pickled if the policy can."""
 
     policy: Any
@@ -99,6 +138,7 @@ class PolicyAgent(Observer):
     initial_state: Callable[[int], Any] | None
     clip: bool
     actions: int | None
+    training_range: TrainingRange | None
     knows: str = MESSAGES
 
     def check(self, game: Game, body: int) -> None:
@@ -111,23 +151,32 @@ class PolicyAgent(Observer):
             )
 
     def begin(self, alert: State, body: int) -> Any:
-        return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)
+        if self.initial_state is None:
+            return self.begin_range(alert.n)
+        return self._own(self.initial_state(alert.n), alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
         """Commands, [n] m/s2, and the policy's new memory.
 
         Raises ``AgentFailed`` for actions of a wrong shape or outside their range.
         """
-        observations = observe_through(self.layers, self.observation, state, body, self.time_step_s)
+        observations = self.observe(self.observation, state, body)
         if self.initial_state is None:
-            answer = self.ask(self.policy, observations)
+            actions = self._actions(self.ask(self.policy, observations), state, body)
+            actions, memory = self.in_range(observations, actions, state, memory, body)
         else:
             pair = self.policy(observations, self._own(memory, state.n))
             if not isinstance(pair, tuple) or len(pair) != 2:
                 right = "with initial_state must return a pair of actions and state"
                 raise AgentFailed(self.name, None, f"vehicle_{body}: returned {pair!r:.60}; {right}")
-            answer, memory = pair[0], self._own(pair[1], state.n)
-        return commands_of(state, body, self._actions(answer, state, body)), memory
+            actions, memory = self._actions(pair[0], state, body), self._own(pair[1], state.n)
+        return commands_of(state, body, actions), memory
+
+    def known_range(self) -> TrainingRange | None:
+        return self.training_range
+
+    def observe(self, view: View, state: State, body: int) -> Observations:
+        return observe_through(self.layers, view, state, body, self.time_step_s)
 
     def _own(self, memory: Any, n: int) -> Any:
         def copied(part: Any) -> NDArray[Any]:
@@ -234,7 +283,8 @@ def policy_agent(
         )
     is_assumed = observation is None and trained_on is None and trained_in is None
     time_step_s = math.nan if trained_in is None else trained_in.time_step_s
-    return PolicyAgent(policy, name, ask, view, is_assumed, time_step_s, initial_state, clip, actions)
+    known = range_of(policy, ask, len(view.names), who)
+    return PolicyAgent(policy, name, ask, view, is_assumed, time_step_s, initial_state, clip, actions, known)
 
 
 def _view(observation: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:

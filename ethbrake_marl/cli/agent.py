@@ -1,13 +1,20 @@
-"""The command ``agent list``."""
+"""The commands ``agent list`` and ``agent show``."""
 
 from __future__ import annotations
+
+from typing import Annotated
 
 import typer
 
 from ethbrake_marl.cli.command import JsonOption, Out, example
-from ethbrake_marl.files.sheet import Sheet
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.sheet import Column, Sheet
 
-agent_group = typer.Typer(help="List the agents.", epilog=example("agent list", "agent list --json"))
+SHOWN_EPISODES = 200
+
+agent_group = typer.Typer(
+    help="List the agents, or show a trained one.", epilog=example("agent list", "agent list --json")
+)
 
 
 @agent_group.command("list", epilog=example("agent list"))
@@ -29,3 +36,44 @@ def agent_list(as_json: JsonOption = False) -> None:
         )
         for reason in why_not_listed():
             out.note(f"left out: {reason}")
+
+
+@agent_group.command("show", epilog=example("agent show universal --scenario stress-wide"))
+def agent_show(
+    name: Annotated[str, typer.Argument(metavar="AGENT", help="A trained policy, such as universal or policy@PATH.")],
+    scenario: Annotated[
+        str | None, typer.Option(metavar="NAME|PATH", help="Also say how well the policy's training covers a scenario.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show where a policy was trained.
+
+    The table has the range of what the policy observed there, without the outermost 0.1 % at each end.
+    """
+    with Out(as_json=as_json) as out:
+        from ethbrake_marl.agents.policy_agent import LearnedAgent
+        from ethbrake_marl.evaluation.door import evaluate
+        from ethbrake_marl.names import make_agent
+
+        agent = make_agent(name)
+        if not isinstance(agent, LearnedAgent):
+            raise InvalidInput(f"agent {name!r}: is no trained policy; name one, such as universal or policy@runs/mine")
+        manifest = agent.policy.manifest
+        known = manifest.training_range
+        if known is None:
+            raise InvalidInput(f"agent {name!r}: its file does not say what it observed in training; train it again")
+        text = f"{name}: {', '.join(manifest.learners)} in {manifest.scenario.get('name')}, by {manifest.algorithm}."
+        if known.fallback:
+            text += f" Outside the range of its training it follows {known.fallback}."
+        if scenario is not None:
+            share = float(evaluate(scenario, name, episodes=SHOWN_EPISODES)[name]["outside"].mean())
+            text += f" In {scenario}, {100 * share:.0f} % of its decisions are outside."
+        ends = zip(agent.policy.observation.features, known.low, known.high, strict=True)
+        columns = (
+            Column("Feature", "feature", text=True),
+            Column("From", "from"),
+            Column("To", "to"),
+            Column("Unit", "unit", text=True),
+        )
+        sheet = Sheet("", columns, [(f.name, f.scale * low, f.scale * high, f.unit) for f, low, high in ends], gap=2)
+        out.result({"about": text, "range": sheet.json()}, text, sheet)

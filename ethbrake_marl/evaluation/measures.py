@@ -175,6 +175,19 @@ def replaced(game: Game, alert: State, last: State) -> MeasureValue:
     return None
 
 
+def outside(game: Game, alert: State, last: State) -> MeasureValue:
+    """Share of a trained policy's decisions outside the range of what it observed in training; for several learners,
+    their mean. Defined if every learner has such a policy.
+    """
+    shield: Any = last.memories.get("shield")
+    memories: Any = [last.memories.get(body) for body in game.settings.learners.tolist()]
+    if shield is not None:
+        memories = getattr(shield, "agents", [getattr(shield, "agent", None)])
+    if not memories or not all(hasattr(memory, "outside") for memory in memories):
+        return None
+    return np.asarray(np.mean([memory.outside for memory in memories], axis=0) / np.maximum(last.steps, 1))
+
+
 def _built_in(of: Callable[[Game, State, State], MeasureValue], unit: str, *statistics: Statistic) -> Measure:
     return Measure(of.__name__, of, of.__doc__ or "", unit, statistics)
 
@@ -216,6 +229,7 @@ DEFAULT = (
     _built_in(end_s, "s"),
     _built_in(ended, ""),
     _built_in(predicted_harm, "m2/s2", Statistic("predicted_harm", "mean", "Predicted harm", "Pre-\ndicted")),
+    _built_in(outside, "1"),
     _built_in(replaced, "1", Statistic("policy_share", "rate", ending="none")),
 )  # fmt: skip
 

@@ -101,7 +101,7 @@ class SummaryTable(list[SummaryRow]):
         return [self.terminal(), *filter(None, [self.measures()])]
 
     def notes(self) -> list[str]:
-        """Warnings for a reader: rejected worlds, exploits, hidden values."""
+        """Warnings for a reader: rejected worlds, exploits, policies outside their training, hidden values."""
         notes, rejected = [], self.parameters.get("rejected_draws", 0)
         if rejected:
             draws = rejected + self.parameters["count"]
@@ -113,6 +113,12 @@ class SummaryTable(list[SummaryRow]):
         exploits = [f"{row.agent} {' and '.join(row.exploits.values())}" for row in self if row.exploits]
         if exploits:
             notes.append(f"{EXPLOITS} Harm does not count this: {'; '.join(exploits)} (docs/train.md).")
+        elsewhere = [f"{row.agent} in {100 * row.outside:.0f} %" for row in self if row.is_elsewhere]
+        if elsewhere:
+            notes.append(
+                "Share of decisions with observations outside the range of the policy's training:"
+                f" {'; '.join(elsewhere)}. There a policy may be worse than full braking (docs/reference/policies.md)."
+            )
         through = [row.agent for row in self if row.sees_through]
         if through:
             notes.append(
@@ -281,4 +287,7 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
         "Passed: no vehicle collides in any world. Harm: mean per world in m²/s². Hardest: largest closing speed of any"
         " first impact."
     )
+    elsewhere = [f"{row.agent} in {name}" for name, table in tables.items() for row in table if row.is_elsewhere]
+    if elsewhere:
+        note += f" More than 10 % of its decisions are outside the range of its training: {', '.join(elsewhere)}."
     return Sheet("", columns, rows, note)

@@ -12,6 +12,7 @@ from ethbrake_marl.files.sheet import Estimate
 
 SEES_THROUGH, EXPLOITS = "†", "‡"  # marks of teams
 PUSHED_FAR_M = 5.0  # Vehicle 1 counts as pushed far above this distance; a mean above it is an exploit
+OUTSIDE_SHARE = 0.1  # a policy drives elsewhere if a larger share of its decisions is outside its training's range
 MOVING_SHARE = 0.05  # an exploit if a vehicle still moves at the horizon in a larger share of worlds
 
 
@@ -44,6 +45,16 @@ class SummaryRow:
     def sees_through(self) -> bool:
         """Whether the team is omniscient: it reads values that the V2X channel hides in these worlds."""
         return self.hidden_share > 0.0 and any(word in self.knows for word in (STATE, MODEL))
+
+    @property
+    def outside(self) -> float:
+        """Share of the decisions of the team's policies outside the range of their training; 0 if it is unknown."""
+        share = self.estimates.get("outside")
+        return 0.0 if share is None else share.value
+
+    @property
+    def is_elsewhere(self) -> bool:
+        return self.outside > OUTSIDE_SHARE
 
     @property
     def exploits(self) -> dict[str, str]:

@@ -18,6 +18,7 @@ from ethbrake_marl.files.model import NAME_PATTERN
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.policies.observed import FiniteModel, ObservationSchema, Sha256
+from ethbrake_marl.policies.training_range import TrainingRange
 from ethbrake_marl.registry import versions_used
 
 LONGEST_STEP_S = 1e6
@@ -51,6 +52,7 @@ class Manifest(FiniteModel):
     seeds: dict[str, int]  # purpose -> seed
     steps: Annotated[int, Field(ge=0)]  # decisions of the learners in training
     versions: dict[str, str]  # at the time of training
+    training_range: TrainingRange | None = Field(None, exclude_if=lambda training_range: training_range is None)
     weights_sha256: Sha256  # of the file with the tensors
     manifest_sha256: Sha256  # of all other fields: `content_sha256`
 
@@ -69,6 +71,8 @@ class Manifest(FiniteModel):
                 f"observation.features: has {len(features)} features; must have {network.observation_size}, the"
                 " observation_size of the network"
             )
+        if self.training_range is not None and len(self.training_range.low) != len(features):
+            raise ValueError(f"training_range: has {len(self.training_range.low)} features; must have {len(features)}")
         forecasts = [name for name in features if name.partition(".")[0] in GROUPS]
         if forecasts and math.isnan(self.time_step_s):
             raise ValueError(

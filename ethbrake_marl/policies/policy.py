@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -24,6 +24,7 @@ from ethbrake_marl.policies.layers import Float32s
 from ethbrake_marl.policies.manifest import Manifest, content_sha256, installed_versions
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.policies.observed import ObservationSchema
+from ethbrake_marl.policies.training_range import TrainingRange
 
 MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"  # the files of a bundle
 
@@ -83,6 +84,11 @@ class Policy:
         except ValueError as error:
             reason = first_mistake(error) if isinstance(error, ValidationError) else error
             raise InvalidInput(f"policy: {reason}") from None
+
+    def with_range(self, training_range: TrainingRange | None) -> Self:
+        manifest = self.manifest.model_copy(update={"training_range": training_range})
+        sha256 = _manifest_sha256(manifest)
+        return replace(self, manifest=manifest.model_copy(update={"manifest_sha256": sha256}))
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
         """Write the bundle as a new folder, completely or not at all.

@@ -24,6 +24,7 @@ from ethbrake_marl.training.fixed_list import Evaluate, Policies, deciding
 from ethbrake_marl.training.recipe import algorithm_of
 from ethbrake_marl.training.run import RunFolder, Status
 from ethbrake_marl.training.training import Training
+from ethbrake_marl.training.training_range import with_ranges
 
 
 class Stopped(Exception):
@@ -196,9 +197,14 @@ class BetweenUpdates(BaseCallback):
             ) from None
 
     def save(self, status: Status, reason: BaseException | None = None) -> None:
-        """Save the policies and the status; delete the checkpoints of a finished training."""
+        """Save the policies with their ranges, and the status; delete the checkpoints of a finished training.
+
+        After an error, ``reason``, the ranges are left out: to record them, the policies must drive.
+        """
         if self.weights:
             self.make_policies()
+        if reason is None:
+            self.policies, self.best = with_ranges(self.policies, self.training), with_ranges(self.best, self.training)
         for policies, place in ((self.chosen, self.folder.policy), (self.policies, self.folder.last_policy)):
             if policies:
                 save_drivers(policies, place, replace=True)

@@ -27,12 +27,15 @@ from ethbrake_marl.agents.team import Agent, Team, play_to_end
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar
+from ethbrake_marl.evaluation.door import evaluate
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.motion.layout import BRAKING, DRIVING
 from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.bundle import load_shipped
+from ethbrake_marl.policies.training_range import TrainingRange
+from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from ethbrake_marl.shields.step import StepShield
 from tests.refused import refused
 
@@ -106,6 +109,36 @@ def test_learned_agent__warns_of_another_training(change: dict[str, Any], text: 
 def test_learned_agent__is_for_policies_of_one_action() -> None:
     with refused("agent 'learned': policy = <function brake"):
         LearnedAgent(brake)  # type: ignore[arg-type]
+
+
+def ranged(high: float, fallback: str = "") -> LearnedAgent:
+    """Agent whose range holds no world, or every one if ``high`` is large."""
+    size = len(PPO.observation.features)
+    return LearnedAgent(PPO.with_range(TrainingRange(low=(-high,) * size, high=(high,) * size, fallback=fallback)))
+
+
+def test_learned_agent__counts_decisions_outside_its_range_also_behind_a_shield() -> None:
+    for agent, share in ((ranged(0.0), 1.0), (ranged(99.0), 0.0)):
+        last = play_to_end(GAME, WORLDS, Team("mine", {2: agent}))
+        assert (last.memories[2].outside == share * last.steps).all() and last.steps.min() > 5
+        shielded = play_to_end(GAME, WORLDS, Team("mine", {2: agent}, StepShield({2: agent})))
+        assert (shielded.memories["shield"].agents[0].outside == share * shielded.steps).all()
+        for shield in (None, StepShield({2: agent}), EpisodeShield({2: agent})):
+            result = evaluate(WORLDS, {"mine": Team("mine", {2: agent}, shield)}, scenario=PAPER)
+            assert (result["mine"]["outside"] == share).all()
+    assert harms(ranged(0.0)) == harms(LearnedAgent(PPO.with_range(None)))
+
+
+def test_learned_agent__follows_its_fallback_outside_only() -> None:
+    assert actions(ranged(0.0, "front_1.acceleration")) == pytest.approx([-0.6] * 12)  # it brakes at 6 m/s2
+    assert actions(ranged(99.0, "front_1.acceleration")) == actions(LearnedAgent(PPO))
+    values = PPO.observation.observe(GAME.reset(WORLDS), np.array([2]), 0.1)[:, 0]
+    middle = float(np.sort(np.abs(values), axis=1)[:, -3].mean()) - 0.05
+    mixed = ranged(middle, "front_1.acceleration")
+    outside = mixed.policy.manifest.training_range.is_outside(values)
+    assert 0 < outside.sum() < 12
+    both = zip(outside, actions(mixed), actions(LearnedAgent(PPO)), strict=True)
+    assert all(mine == pytest.approx(-0.6) if out else mine == alone for out, mine, alone in both)
 
 
 # ---------------------------------------------------------------- every kind of policy

@@ -292,7 +292,7 @@ def test_measures__that_are_not_asked_for_or_not_defined_have_no_column(scenario
     asked = ["still_moving", "pushed_m"]
     result = eb.evaluate(scenario, "full_brake", episodes=2, measures=asked)
     names = {each.name for each in result.measures if each.name not in result["full_brake"]}
-    assert names == {"predicted_harm", "replaced", "pushed_m"}  # pushed_m has columns of vehicles alone
+    assert names == {"outside", "predicted_harm", "replaced", "pushed_m"}  # pushed_m has columns of vehicles alone
     assert {column for column in result["full_brake"] if column.startswith("pushed_m")} == pushed
     usual = eb.evaluate(scenario, "full_brake", episodes=2)["full_brake"]
     assert not any(column.startswith(tuple(asked)) for column in usual)

@@ -56,6 +56,19 @@ def test_estimates__are_those_of_the_columns(result: Result) -> None:
         full["total_harms"]
 
 
+def test_policy_outside_its_training__is_told_in_one_line() -> None:
+    at_home, elsewhere = (eb.evaluate(name, "full_brake,ppo", episodes=20) for name in ("paper-random", PAIR))
+    assert at_home["ppo"]["outside"].mean() < 0.02 and "outside" not in at_home["full_brake"]
+    share = elsewhere["ppo"]["outside"].mean()
+    notes = summarise(elsewhere).notes()
+    assert not any("outside" in note for note in summarise(at_home).notes()) and share > 0.3
+    assert [note for note in notes if f"range of the policy's training: ppo in {100 * share:.0f} %." in note]
+    assert summarise(elsewhere).to_json()[1]["outside"] == pytest.approx(share)
+    results = {"home": at_home, "pair": elsewhere}
+    sheet = summarise_lists({name: summarise(result) for name, result in results.items()}, results)
+    assert sheet.note.endswith("outside the range of its training: ppo in pair.")
+
+
 def test_baseline__can_be_another_or_missing(result: Result) -> None:
     gentle = summarise(result, baseline="constant:4.0")
     same = [row["total_harm_difference"] == statistics.Estimate(0.0, (0.0, 0.0)) for row in gentle]

@@ -47,6 +47,26 @@ from tests.refused import refused
 from tests.training.tiny import PAIR, TINY, TINY_SAC, TRAININGS, UPDATE, begin, dying_after, go_on, kept, killed
 
 
+@pytest.mark.parametrize("name", ["ppo", "shared", "independent"])
+def test_policies__know_the_range_of_their_training(name: str, tmp_path: Path) -> None:
+    result = begin(name, tmp_path / "run")
+    for policies in (result.policies, result.last_policies):
+        for vehicle, policy in policies.items():
+            low, high = (
+                np.array(end) for end in (policy.manifest.training_range.low, policy.manifest.training_range.high)
+            )
+            names = list(policy.observation.names)
+            assert len(low) == len(names) and (low <= high).all() and (low < high).any()
+            capacity = names.index("own.braking_capacity")
+            both = name == "shared"  # Vehicle 2 brakes at 7 m/s2, Vehicle 3 at 6
+            assert low[capacity] == pytest.approx(0.6 if both or vehicle == "vehicle_3" else 0.7)
+            assert high[capacity] == pytest.approx(0.7 if both or vehicle == "vehicle_2" else 0.6)
+    assert load_drivers(tmp_path / "run" / "policy").values() and all(
+        policy.manifest == result.policies[vehicle].manifest
+        for vehicle, policy in load_drivers(tmp_path / "run" / "policy").items()
+    )
+
+
 def status_of(run: Path) -> dict[str, Any]:
     content: dict[str, Any] = json.loads((run / "run.json").read_text())
     return content

@@ -50,7 +50,7 @@ FIRST_HARM, TOTAL_HARM, PER_COMMAND = 2 * PER_SIDE, 2 * PER_SIDE + 1, 2 * PER_SI
 FAR_PER_COMMAND = 4  # features of `contact_far`
 
 
-def _near(command: str, held: str) -> list[Feature]:
+def impact_features(command: str, held: str) -> list[Feature]:
     features = []
     for side, where in SIDES.items():
         name, impact = f"{command}_{side}", f"forecast for {held}, first impact with {where}"
@@ -60,6 +60,11 @@ def _near(command: str, held: str) -> list[Feature]:
             Feature(f"{name}_fraction", "1", 1.0, 0.0, 1.0, f"{impact}: time within its decision step, 0 to 1"),
             Feature(f"{name}_steps", "1", 10.0, 0.0, 2.0, f"{impact}: number of full decision steps before it"),
         ]
+    return features
+
+
+def _near(command: str, held: str) -> list[Feature]:
+    features = impact_features(command, held)
     for count in ("first_impact", "total"):
         about = f"forecast for {held}: {count.replace('_', '-')} harm of known pairs"
         features.append(Feature(f"{command}_{count}_harm", "m2/s2", 50.0, 0.0, 4.0, about))
@@ -135,7 +140,12 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
                 if outcome == FAILED:
                     failed = k
                 value = out[k, o, c * PER_COMMAND : (c + 1) * PER_COMMAND]
-                write_features(scratch, outcome == EVENT_BY_EVENT, i, first, last, time_step_s, value)
+                has_impact = outcome == EVENT_BY_EVENT
+                write_impacts(scratch, has_impact, i, first, last, time_step_s, value)
+                value[FIRST_HARM] = value[TOTAL_HARM] = 0.0
+                for p in range(first, last if has_impact else first):
+                    value[FIRST_HARM] += scratch[NEW_FIRST, p]
+                    value[TOTAL_HARM] += scratch[NEW_TOTAL, p]
                 far = near + c * FAR_PER_COMMAND
                 out[k, o, far], out[k, o, far + 1] = value[IMPACT_TIME], value[PER_SIDE + IMPACT_TIME]
                 out[k, o, far + 2] = math.sqrt(value[FIRST_HARM])
@@ -144,8 +154,8 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
 
 
 @kernel
-def write_features(scratch, has_impact, i, first, last, time_step_s, value):
-    """Write the features of one forecast for body i to ``value``; features of an unknown pair are 0.
+def write_impacts(scratch, has_impact, i, first, last, time_step_s, value):
+    """Write the features of body i's first impacts in one forecast to ``value``; features of an unknown pair are 0.
 
     ``scratch``: results of the forecast's simulation. ``has_impact``: whether this simulation contains an impact.
     ``first``, ``last``: first and last known body. An impact exactly at the end of a time step belongs to this step, as
@@ -163,10 +173,6 @@ def write_features(scratch, has_impact, i, first, last, time_step_s, value):
             impact[IMPACT_CLOSING] = scratch[NEXT_CLOSING, p] if hit else 0.0
             impact[IMPACT_FRACTION] = steps - full_steps if hit else 0.0
             impact[IMPACT_STEPS] = full_steps
-    value[FIRST_HARM] = value[TOTAL_HARM] = 0.0
-    for p in range(first, last if has_impact else first):
-        value[FIRST_HARM] += scratch[NEW_FIRST, p]
-        value[TOTAL_HARM] += scratch[NEW_TOTAL, p]
 
 
 def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:

@@ -17,7 +17,8 @@ def to_onnx(policy: Policy) -> bytes:
     """ONNX model as bytes: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
     The acceleration is the action times the observed braking or driving capacity. Results may differ from this
-    package's by rounding. The model's metadata list the names of the observed features. Raises ``InvalidInput`` if the
+    package's by rounding. The model's metadata have the names of the observed features, and the range of the training
+    with the name of the fallback, which is not in the model. Raises ``InvalidInput`` if the
     policy does not observe both capacities of its vehicle, and ``MissingExtra`` if the package onnx is not installed.
     """
     manifest, observation, tensors = policy.manifest, policy.observation, policy.tensors
@@ -78,14 +79,14 @@ def to_onnx(policy: Policy) -> bytes:
     graph = helper.make_graph(nodes, "policy", inputs, outputs, constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], producer_name="ethbrake-marl")
     model.ir_version = 8  # supported by every runtime since 2022
-    helper.set_model_props(
-        model,
-        {
-            "algorithm": manifest.algorithm,
-            "manifest_sha256": manifest.manifest_sha256,
-            "features": ",".join(observation.names),
-        },
-    )
+    metadata = {
+        "algorithm": manifest.algorithm,
+        "manifest_sha256": manifest.manifest_sha256,
+        "features": ",".join(observation.names),
+    }
+    if manifest.training_range is not None:
+        metadata["training_range"] = manifest.training_range.model_dump_json()
+    helper.set_model_props(model, metadata)
     onnx.checker.check_model(model)
     data: bytes = model.SerializeToString()
     return data

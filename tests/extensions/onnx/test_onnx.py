@@ -11,6 +11,7 @@ import onnxruntime
 import pytest
 
 from ethbrake_marl.agents.policy_agent import LearnedAgent, policy_agent
+from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import AgentFailed
 from ethbrake_marl.extensions.onnx import to_onnx
@@ -72,6 +73,31 @@ def test_onnx__observes_what_its_metadata_name() -> None:
     agent = policy_agent(model.SerializeToString(), name="file", observation=[*OTHERS, "place"])
     with refused("agent 'file', vehicle_2: act fails", AgentFailed):
         harms(agent)
+
+
+def test_onnx__knows_the_range_of_its_training() -> None:
+    ranged = PPO.with_range(PPO.manifest.training_range.model_copy(update={"fallback": "plan.action"}))
+    agent = policy_agent(to_onnx(ranged), name="file")
+    assert agent.training_range == ranged.manifest.training_range
+    scenario, game = open_game("cooperation-1-front")
+    worlds = scenario.sample(12, 7)
+    alone, file = (play_to_end(game, worlds, Team("mine", {2: mine})) for mine in (LearnedAgent(ranged), agent))
+    np.testing.assert_allclose(file.harm("honest"), alone.harm("honest"), rtol=1e-4, atol=1e-4)
+    assert file.memories[2].outside.tolist() == alone.memories[2].outside.tolist() and alone.memories[2].outside.all()
+
+
+@pytest.mark.parametrize(
+    ("text", "refusal"),
+    [
+        ("{", "agent 'file': training_range in the model's metadata: "),
+        ('{"low": [0], "high": [1]}', "agent 'file': training_range in the model's metadata must have 27 features"),
+    ],
+)
+def test_onnx__with_a_bad_range_is_refused(text: str, refusal: str) -> None:
+    model = onnx.load_model_from_string(to_onnx(PPO))
+    onnx.helper.set_model_props(model, {"features": ",".join(PPO.observation.names), "training_range": text})
+    with refused(refusal):
+        policy_agent(model.SerializeToString(), name="file")
 
 
 def test_export__replaces_a_file_only_by_force(refuse: Refuse) -> None:

@@ -1,0 +1,41 @@
+"""Records the range of what policies observe in worlds of their training."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.agents.team import Team, play
+from ethbrake_marl.episode.observe import Observations
+from ethbrake_marl.names import open_game
+from ethbrake_marl.policies.training_range import TrainingRange
+from ethbrake_marl.training.fixed_list import Policies
+from ethbrake_marl.training.training import Training
+from ethbrake_marl.worlds.game import AnyScenario
+
+MOST_WORLDS = 1_000  # of the fixed list that are driven
+
+
+def with_ranges(policies: Policies, training: Training) -> Policies:
+    """The policies, each with the range of what it observes in the fixed list of the training."""
+    listed = training.recipe.evaluation
+    return record_ranges(policies, training.scenario, min(listed.worlds, MOST_WORLDS), listed.seed) if policies else {}
+
+
+def record_ranges(policies: Policies, scenario: AnyScenario, worlds: int, seed: int, fallback: str = "") -> Policies:
+    """The policies (learner -> policy), each with the range of what it observes in ``worlds`` worlds of ``scenario``.
+
+    Learners that share a policy share its range. ``fallback``: as in ``TrainingRange``.
+    """
+    loaded, game = open_game(scenario)
+    drivers = {
+        1 + loaded.vehicle_names.index(name): LearnedAgent(policy.with_range(None)) for name, policy in policies.items()
+    }
+    observed: dict[int, list[Observations]] = {id(policy): [] for policy in policies.values()}
+    for _, state in play(game, loaded.sample(worlds, seed), Team("policy", drivers)):
+        running = state.take(~state.ended)
+        for policy, (body, agent) in zip(policies.values(), game.agents(drivers).items(), strict=True):
+            observed[id(policy)].append(agent.observe(policy.observation, running, body))
+    ranges = {key: TrainingRange.of(np.concatenate(parts), fallback) for key, parts in observed.items()}
+    ranged = {id(policy): policy.with_range(ranges[id(policy)]) for policy in policies.values()}
+    return {name: ranged[id(policy)] for name, policy in policies.items()}
