@@ -134,7 +134,7 @@ def test_maximin__is_at_least_as_good_for_whoever_bears_most_as_every_point(fron
     assert found.mean() < 0.99 * front.borne["first"].max(axis=2).min(axis=0).mean()
 
 
-@pytest.mark.parametrize("count", ["first", "honest"])
+@pytest.mark.parametrize("count", ["honest", pytest.param("first", marks=pytest.mark.slow)])
 def test_two_learners__are_never_worse_than_one_nor_than_agents_that_drive_one_or_both(count: str) -> None:
     pair, rows, heard = eb.load_scenario("cooperation-3-pair"), WEIGHTS[[1, 3, 6]], []
     agents = ["e_v2x_bm", "universal", "vine-pair"]
