@@ -137,8 +137,8 @@ def test_spec__every_argument_goes_through_json_and_makes_the_same_episode(given
 
 
 LATER = {
-    "name": "later", "based_on": "realistic-motorway", "speeds_mps": {"uniform": [3, 8]}, "gaps_m": {"uniform": [4, 12]},
-    "alert_s": {"uniform": [1, 5]}, "horizon_s": 9.0,
+    "name": "later", "based_on": "realistic-motorway", "horizon_s": 9.0,
+    "speeds_mps": {"uniform": [3, 8]}, "gaps_m": {"uniform": [4, 12]}, "alert_s": {"uniform": [1, 5]},
 }  # fmt: skip
 
 

@@ -9,6 +9,8 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from functools import partialmethod
+from importlib.machinery import SourceFileLoader as Loader
 from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
@@ -52,15 +54,28 @@ def begin(folder: Path, cache: Path, *options: str, before: str = "") -> subproc
 
 
 def test_machine_code__is_loaded_until_a_source_changes(tmp_path: Path) -> None:
-    def ask(factor: float, *options: str) -> list[str]:
+    def ask(factor: float) -> list[str]:
         (tmp_path / "kernels.py").write_text(KERNELS.format(factor=factor))
-        said, warned = begin(tmp_path, tmp_path / "cache", *options).communicate()
+        said, warned = begin(tmp_path, tmp_path / "cache").communicate()
         assert warned == ""
         return said.split()
 
     assert ask(2.0) == ["compiles", "True", "42.0"]
-    assert ask(2.0, "-OO") == ["42.0"]
     assert ask(3.0) == ["compiles", "False", "62.0"]  # what another kernel contains
+
+
+def test_machine_code__is_loaded_without_docstrings(ask: Callable, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    ask()
+    monkeypatch.setattr(Loader, "source_to_code", partialmethod(Loader.source_to_code, _optimize=2))
+    assert ask() == (42.0, 0, [])
+
+
+@pytest.mark.slow
+def test_python_oo__uses_the_same_machine_code(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNELS.format(factor=2.0))
+    for options, said in (((), "compiles True\n42.0\n"), (("-OO",), "42.0\n")):
+        assert begin(tmp_path, tmp_path / "cache", *options).communicate() == (said, "")
 
 
 @pytest.mark.slow
