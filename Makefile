@@ -68,7 +68,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "== Installing ethbrake_marl"
 	@$(INSTALL) -e ".[report]"
 	@echo "== Compiling the physics in the background"
-	@PYTHONPATH="$(CURDIR)" $(BIN)/python -c "from ethbrake_marl.cli import doctor; raise SystemExit(not doctor.compile_ahead(training=False, run_alone=True)[0])" & \
+	@sh .ci/compile "$(CURDIR)/$(BIN)/ethbrake" & \
 	compiling=$$!; \
 	trap "kill $$compiling" INT TERM; \
 	echo "== Installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX),: uv chooses the build for this machine)"; \
@@ -76,7 +76,7 @@ $(STAMP): pyproject.toml constraints.txt
 	echo "== Installing the packages for training and tests, at the versions of constraints.txt"; \
 	$(INSTALL) -e ".[train,dev]" || exit; \
 	wait $$compiling || \
-	  echo "== Some of the physics could not be compiled (see above); it is compiled when it is needed" >&2
+	  echo "== Some of the physics could not be compiled (see above); commands compile it when they need it" >&2
 	@echo "== torch $$($(BIN)/python -c 'from importlib.metadata import version; print(version("torch"))')"
 	@$(BIN)/ethbrake evaluate --help >/dev/null
 	@echo "$(CURDIR)" > $@

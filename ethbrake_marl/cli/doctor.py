@@ -35,12 +35,6 @@ _DOORS = (
     ("evaluate", "--agents", "full_brake,ppo+episode,full_brake+step", "--episodes", "1"),
 )
 
-# A command that uses exactly the kernels of `ethbrake run`, except for three small kernels, but does not need torch.
-_FOR_A_RUN = (
-    *("-m", "ethbrake_marl", "evaluate", "--episodes", "20", "--output", "page", "--report"),
-    *("--agents", "full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo,ppo+episode"),
-)
-
 _IN_PYTHON = """
 import ethbrake_marl as eb
 for given in ({}, {"reward": {"harm": 0.05, "shaping": 0.05}}):  # shaped, as PPO is trained
@@ -166,19 +160,18 @@ def _golden_baseline() -> tuple[bool, str]:
     return computed == expected, f"E-V2X-BM with gaps of 7 m and 7 m: {computed} (known result: {expected})"
 
 
-def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
+def compile_ahead(*, training: bool) -> tuple[bool, str]:
     """Compile and store the numba kernels of the usual commands, by running these commands on a few worlds.
 
-    ``training``: also run ``ethbrake run``, which needs torch. ``run_alone``: run only the command that compiles nearly
-    all kernels of ``ethbrake run``. Returns whether all commands succeeded, and a message for the user.
+    ``training``: also run ``ethbrake run``, which needs torch. Returns whether all commands succeeded, and a message
+    for the user.
     """
     if reason := obstacle():
         return False, f"{reason}; {UNSTORED}"
     begun = perf_counter()
     doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if training or door[0] != "run"]
-    doors = [_FOR_A_RUN] if run_alone else [*doors, ("-c", _IN_PYTHON)]
     with tempfile.TemporaryDirectory() as folder:
-        failed = [reason for door in doors if (reason := _call(door, folder))]
+        failed = [reason for door in [*doors, ("-c", _IN_PYTHON)] if (reason := _call(door, folder))]
     return not failed, "; ".join(failed) or f"all kernels compiled in {perf_counter() - begun:.0f} s"
 
 

@@ -6,7 +6,7 @@ import copy
 import pickle
 import warnings
 from collections import deque
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Agent, Team, play_to_end
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.observe import View
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar
 from ethbrake_marl.evaluation.door import evaluate
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
@@ -41,19 +42,23 @@ from tests.refused import refused
 
 PAPER, GAME = open_game("paper-random")
 OBSTACLE = open_game("paper-random-obstacle")
-WORLDS = PAPER.sample(12, 7)
 PPO = load_shipped("ppo")
 OTHERS = ["own", "rear_1", "front_1"]  # as many features as the usual ones
 TINY = {"net_arch": [4]}
 
 
-def harms(agent: Agent, game: Any = GAME, worlds: Any = WORLDS) -> list[float]:
-    return play_to_end(game, worlds, Team("mine", {2: agent})).harm("first").tolist()
+@cache
+def sampled() -> State:
+    return PAPER.sample(12, 7)
+
+
+def harms(agent: Agent, game: Any = GAME, worlds: State | None = None) -> list[float]:
+    return play_to_end(game, sampled() if worlds is None else worlds, Team("mine", {2: agent})).harm("first").tolist()
 
 
 def actions(agent: Agent) -> list[float]:
-    state = GAME.reset(WORLDS)
-    command = agent.act(state, agent.begin(WORLDS, 2), 2)[0]
+    state = GAME.reset(sampled())
+    command = agent.act(state, agent.begin(sampled(), 2), 2)[0]
     return (command / np.where(command < 0.0, state.car[:, BRAKING, 2], state.car[:, DRIVING, 2])).tolist()
 
 
@@ -78,7 +83,7 @@ def rows(n: int = 2, **settings: Any) -> Any:
 
 
 def test_learned_agent__acts_in_fractions_of_the_vehicles_capacity() -> None:
-    state = GAME.reset(WORLDS)
+    state = GAME.reset(sampled())
     action = PPO(PPO.observation.observe(state, np.array([3]), 0.1)[:, 0])[:, 0].astype(float)
     command = LearnedAgent(PPO).act(state, None, 3)[0]
     braking, driving = state.car[:, BRAKING, 3], state.car[:, DRIVING, 3]
@@ -101,7 +106,7 @@ def test_learned_agent__warns_of_another_training(change: dict[str, Any], text: 
     policy = type(PPO)(PPO.manifest.model_copy(update=change), PPO.tensors)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        play_to_end(GAME, WORLDS, Team("old", {2: LearnedAgent(policy, "old")}))
+        play_to_end(GAME, sampled(), Team("old", {2: LearnedAgent(policy, "old")}))
     texts = [str(each.message) for each in caught if each.category is Unfamiliar]
     assert len(texts) == (text is not None) and all(each.startswith(text or "") for each in texts)
 
@@ -147,7 +152,7 @@ def test_learned_agent__follows_its_fallback_outside_only() -> None:
 @pytest.mark.parametrize("shape", [(-1, 1), (-1,)])
 def test_function__drives_by_what_it_returns(shape: tuple[int, ...]) -> None:
     agent = policy_agent(lambda seen: (seen[:, 1] - 0.6).clip(-0.8, 0.4).reshape(shape))
-    seen = View().observe(GAME.reset(WORLDS), np.array([2]), 0.1)[:, 0, 1]
+    seen = View().observe(GAME.reset(sampled()), np.array([2]), 0.1)[:, 0, 1]
     assert actions(agent) == pytest.approx((seen - 0.6).clip(-0.8, 0.4).tolist())
     assert (
         agent.name == "<lambda>" and policy_agent(brake).name == "brake" and policy_agent(brake, name="b").name == "b"
@@ -195,15 +200,15 @@ def no_steps(n: int) -> Any:
 
 
 def test_memory__belongs_to_each_world_and_to_nobody_else() -> None:
-    agent, state = policy_agent(ramp, initial_state=no_steps), GAME.reset(WORLDS)
-    memory = agent.begin(WORLDS, 2)
+    agent, state = policy_agent(ramp, initial_state=no_steps), GAME.reset(sampled())
+    memory = agent.begin(sampled(), 2)
     for k in range(3):
         before = copy.deepcopy(memory)
         command, after = agent.act(state, memory, 2)
         assert command == pytest.approx(-k / 10.0 * state.car[:, BRAKING, 2])
         assert all(np.array_equal(a, b) for a, b in zip(before, memory, strict=True))
         memory = after
-    bound = play_to_end(GAME, WORLDS, Team("mine", {2: agent}, StepShield({2: agent})))
+    bound = play_to_end(GAME, sampled(), Team("mine", {2: agent}, StepShield({2: agent})))
     assert (bound.harm("first") <= bound.memories["shield"].first).all() and sum(harms(agent)) > bound.harm().sum()
 
 

@@ -109,7 +109,8 @@ def test_result_in_a_file__may_have_no_stdout(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "line", ["agent list", "scenario schema", "--help", pytest.param(COAST, marks=pytest.mark.slow)]
+    "line",
+    ["agent list", "--help", *(pytest.param(each, marks=pytest.mark.slow) for each in ("scenario schema", COAST))],
 )
 def test_reader_that_goes__is_status_1_without_a_word(line: str) -> None:
     reading, writing = os.pipe()

@@ -4,6 +4,7 @@ import copy
 import json
 import pickle
 from collections.abc import Callable, Iterator
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -279,20 +280,23 @@ def test_options__a_listed_world_and_those_that_follow_serve_one_episode(name: s
     assert np.array_equal(interface.reset(), stream.reset(5))
 
 
-DRAWN = load_scenario(
-    {"name": "both", "mixture": [{"scenario": "realistic-mixed"}, {"scenario": "realistic-truck"}]}
-)  # types in one of the two
+@cache
+def mixture() -> Scenario:
+    """Types in one of the two."""
+    return load_scenario(
+        {"name": "both", "mixture": [{"scenario": "realistic-mixed"}, {"scenario": "realistic-truck"}]}
+    )
 
 
 def drawn(seed: int, world: int) -> dict[str, Any]:
-    columns = columns_of(DRAWN.draw(1, seed, first=world, purpose="training"))
+    columns = columns_of(mixture().draw(1, seed, first=world, purpose="training"))
     assert "scenario" in columns
     return {"world_seed": seed} | {name: column[0].item() for name, column in columns.items()}
 
 
 @each_interface
 def test_describe_world__tells_the_numbers_of_its_sample_for_every_world_that_has_begun(name: str) -> None:
-    interface = make(name, DRAWN)
+    interface = make(name, mixture())
     interface.reset(3)
     assert interface.drawn() == [drawn(3, world) for world in range(interface.n)]
     for _ in range(60):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ethbrake_marl.episode.reward import RewardParams
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.names import open_game
 from tests.contract.interfaces import CRASH, REST
 from tests.episode.lines import later, state_of
@@ -18,19 +20,23 @@ near = pytest.approx
 # Vehicle 2 drives at 2 m/s2 from 0.5 s on, 1 m behind Vehicle 1, at the same speed: contact at 0.5 + 1 = 1.5 s, with
 # 2 m/s. From then on (e = 0) both are pushed. Vehicle 3 drives, too, and has fallen far behind.
 CLOSE = state_of([1.0, 90.0], [10.0, 10.0, 0.0], latency_s=[0.0, 0.5, 0.0])
-DRIVEN = later(CLOSE, [0.0, 2.0, 1.0], 4.0)
+
+
+@cache
+def after_contact() -> State:
+    return later(CLOSE, [0.0, 2.0, 1.0], 4.0)
 
 
 def test_drove__counts_what_the_engine_does() -> None:
-    terms = paid({"harm": 0.0, "drove": 1.0}, CLOSE, DRIVEN).terms
+    terms = paid({"harm": 0.0, "drove": 1.0}, CLOSE, after_contact()).terms
     assert terms["drove"][0].tolist() == near([0.0, -7.0, -4.0])
 
 
 def test_push__is_the_push_of_the_step_of_all_pairs() -> None:
-    terms = paid({"harm": 0.0, "push": 3.0}, CLOSE, DRIVEN).terms
+    terms = paid({"harm": 0.0, "push": 3.0}, CLOSE, after_contact()).terms
     assert terms["push"].tolist() == near([-2.0 * 2.5])  # 2 and 0 m/s2, for 2.5 s
-    after = later(DRIVEN, [-1.0, 2.0, 1.0], 5.0)
-    step = paid({"harm": 0.0, "push": 3.0}, DRIVEN, after)
+    after = later(after_contact(), [-1.0, 2.0, 1.0], 5.0)
+    step = paid({"harm": 0.0, "push": 3.0}, after_contact(), after)
     assert step.terms["push"].tolist() == near([-3.0]) and step.reward[0].tolist() == near([-9.0] * 3)
     against = state_of([0.0], [0.0, 0.0], obstacle_gap_m=0.0)  # 3 against the obstacle, 2 against Vehicle 1
     assert paid({"harm": 0.0, "push": 1.0}, against, later(against, [3.0, 2.0], 1.0)).terms["push"] == near(-5.0)

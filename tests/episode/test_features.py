@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,11 @@ FOUR = state_of(
     braking_capacity_mps2=[6.0, 7.0, 5.0, 8.0], driving_capacity_mps2=[1.0, 2.0, 3.0, 4.0],
     latency_s=[0.0, 0.5, 0.25, 1.0], mass_t=[4.5, 5.5, 5.9, 7.0], restitution=0.1,
 )  # fmt: skip
-AFTER = later(FOUR, [-6.0, 0.0, -5.0, 0.0], 0.5)
+
+
+@cache
+def braked() -> State:
+    return later(FOUR, [-6.0, 0.0, -5.0, 0.0], 0.5)
 
 
 def test_features__of_vehicle_3_by_hand() -> None:
@@ -56,15 +61,15 @@ def test_features__of_vehicle_3_by_hand() -> None:
         "rear_1.latency_left": 0.5, "rear_1.hit": 0.0, "rear_1.stopping_margin": (gap3 + own - rear) / 10,
         "rear_1.fitting_deceleration": 2.0,
     }  # fmt: skip
-    found = seen(AFTER, 3, TWO_AHEAD)
+    found = seen(braked(), 3, TWO_AHEAD)
     assert [*found] == [*expected] and found == pytest.approx(expected, abs=1e-5)
 
 
 def test_what_is_not_known_or_not_there__is_zero() -> None:
     # Vehicle 4 may not act yet, and nobody drives ahead of Vehicle 1
-    assert {value for name, value in seen(AFTER, 4, TWO_AHEAD).items() if not name.startswith("own.")} == {0.0}
-    assert set(seen(AFTER, 1, TWO_AHEAD, "front_").values()) == {0.0}
-    assert seen(AFTER, 1, TWO_AHEAD, "rear_1.known") == {"rear_1.known": 1.0}
+    assert {value for name, value in seen(braked(), 4, TWO_AHEAD).items() if not name.startswith("own.")} == {0.0}
+    assert set(seen(braked(), 1, TWO_AHEAD, "front_").values()) == {0.0}
+    assert seen(braked(), 1, TWO_AHEAD, "rear_1.known") == {"rear_1.known": 1.0}
 
 
 def test_who_is_unknown__can_do_anything_unseen() -> None:
@@ -81,7 +86,7 @@ def test_who_is_unknown__can_do_anything_unseen() -> None:
 
 
 def test_hit__belongs_to_the_pair_on_that_side() -> None:
-    struck = later(AFTER, [-6.0, 0.0, -5.0, 0.0], 2.0)
+    struck = later(braked(), [-6.0, 0.0, -5.0, 0.0], 2.0)
     assert struck.pair_hit.tolist() == [[True, False, False]]
     hits = [[seen(struck, body, TWO_AHEAD)[f"{side}.hit"] for side in ("front_1", "rear_1")] for body in (1, 2, 3)]
     assert hits == [[0.0, 1.0], [1.0, 0.0], [0.0, 0.0]]
@@ -98,7 +103,7 @@ def test_place_and_obstacle__by_hand() -> None:
         "obstacle.known": 1.0, "obstacle.gap": 4.2, "obstacle.hit": 0.0, "obstacle.stopping_margin": 1.7,
         "obstacle.fitting_deceleration": round(400 / 84 / 10, 5),
     }  # fmt: skip
-    assert set(seen(start, 2, view, "obstacle").values()) == set(seen(AFTER, 1, view, "obstacle").values()) == {0.0}
+    assert set(seen(start, 2, view, "obstacle").values()) == set(seen(braked(), 1, view, "obstacle").values()) == {0.0}
     margin = {1: 22 - 20**2 / 16, 2: 32 - 18**2 / 16, 3: 34 - 22**2 / 16, 4: 56 - 10**2 / 16}
     expected = {1: (0.0, 2.0, 2.2), 2: (1.0, 2.0, 3.2), 3: (2.0, 1.0, 3.4), 4: (2.0, 0.0, 5.6)}
     for body, (ahead, behind, gap) in expected.items():
@@ -151,14 +156,14 @@ def test_view__of_some_features_has_the_bits_of_the_whole_in_its_own_order(liste
     view = View(listed)
     groups = View(["own", "front_1", "front_2", "rear_1", "role", "obstacle", "place", "own_build_up_time",
                    "front_1.harm_weight"])  # fmt: skip
-    whole = dict(zip(groups.names, groups.observe(AFTER, np.array([3]), 0.1)[0, 0], strict=True))
-    assert view.observe(AFTER, np.array([3]), 0.1)[0, 0].tolist() == [whole[name] for name in view.names]
+    whole = dict(zip(groups.names, groups.observe(braked(), np.array([3]), 0.1)[0, 0], strict=True))
+    assert view.observe(braked(), np.array([3]), 0.1)[0, 0].tolist() == [whole[name] for name in view.names]
 
 
 def test_views_of_several_bodies__are_theirs_alone() -> None:
-    together = TWO_AHEAD.observe(AFTER, np.array([3, 1]), 0.1)
-    assert together[0, 0].tobytes() == TWO_AHEAD.observe(AFTER, np.array([3]), 0.1)[0, 0].tobytes()
-    assert together[0, 1].tobytes() == TWO_AHEAD.observe(AFTER, np.array([1]), 0.1)[0, 0].tobytes()
+    together = TWO_AHEAD.observe(braked(), np.array([3, 1]), 0.1)
+    assert together[0, 0].tobytes() == TWO_AHEAD.observe(braked(), np.array([3]), 0.1)[0, 0].tobytes()
+    assert together[0, 1].tobytes() == TWO_AHEAD.observe(braked(), np.array([1]), 0.1)[0, 0].tobytes()
 
 
 def test_role_and_obstacle__are_observed_only_where_there_is_an_obstacle() -> None:

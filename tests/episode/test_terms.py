@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -42,8 +44,10 @@ def paid(reward: dict[str, Any], before: State, after: State, **settings: Any) -
     return rewarding.complete(before, step._replace(reward=np.repeat(compiled, after.vehicles, axis=1)), after)[1]
 
 
-# Vehicle 2 strikes Vehicle 1 at 10 m/s; Vehicle 3 falls back.
-STRUCK = moved([1.0, 5.0], [10.0, 20.0, 4.0], 0.5, [0.0, 0.0, -2.0])
+@cache
+def struck() -> tuple[State, State]:
+    """Vehicle 2 strikes Vehicle 1 at 10 m/s; Vehicle 3 falls back."""
+    return moved([1.0, 5.0], [10.0, 20.0, 4.0], 0.5, [0.0, 0.0, -2.0])
 
 
 @pytest.mark.parametrize(
@@ -57,7 +61,7 @@ STRUCK = moved([1.0, 5.0], [10.0, 20.0, 4.0], 0.5, [0.0, 0.0, -2.0])
     ],
 )
 def test_term__of_a_step_by_hand(reward: dict[str, float], safe: bool, name: str, value: list[float]) -> None:
-    step = paid(reward, *STRUCK, safe=safe)
+    step = paid(reward, *struck(), safe=safe)
     assert [*step.terms] == [name]
     assert np.broadcast_to(step.terms[name].reshape(1, -1), (1, 3))[0].tolist() == value
     weight = max(each for key, each in reward.items() if key != "k_energy")
@@ -68,34 +72,35 @@ def sigmoid(x: float) -> float:
     return 1.0 / (1.0 + math.exp(-x))
 
 
-# After STRUCK gap 1 is 0 + 5 m/s * 0.4 s = 2 m, opening; gap 2 is 5 + 2 + 0.4 * 12.5 - (2 - 0.25) = 10.25 m, opening.
+# After struck() gap 1 is 0 + 5 m/s * 0.4 s = 2 m, opening; gap 2 is 5 + 2 + 0.4 * 12.5 - (2 - 0.25) = 10.25 m, opening.
 OPENING = -sigmoid(0.5 * (3.0 - 2.0)), -sigmoid(0.5 * (3.0 - 10.25))
 
 
 @pytest.mark.parametrize(
     ("states", "gaps", "settings", "value"),
     [
-        (STRUCK, [2.0, 10.25], {"distance_slope_per_m": 0.5}, [OPENING[0], sum(OPENING), OPENING[1]]),
+        (struck, [2.0, 10.25], {"distance_slope_per_m": 0.5}, [OPENING[0], sum(OPENING), OPENING[1]]),
         (  # pairs that close add the time to collision, to the safety buffer of 1 m: slow ones too
-            moved([7.0], [0.0, 4.0], 0.5), [5.0], {"ttc_scale_s": 2.0},
+            partial(moved, [7.0], [0.0, 4.0], 0.5), [5.0], {"ttc_scale_s": 2.0},
             [-sigmoid(-((5.0 - 1.0) / 4.0) / 2.0) - sigmoid(3.0 - 5.0)] * 2,
         ),
         (
-            moved([7.0], [0.0, 0.5], 2.0), [6.0], {"ttc_scale_s": 10.0},
+            partial(moved, [7.0], [0.0, 0.5], 2.0), [6.0], {"ttc_scale_s": 10.0},
             [-sigmoid(-((6.0 - 1.0) / 0.5) / 10.0) - sigmoid(3.0 - 6.0)] * 2,
         ),
-        (moved([3.0], [0.0, 4.0], 0.625), [0.5], {}, [-0.5 - sigmoid(3.0 - 0.5)] * 2),  # within the buffer
+        (partial(moved, [3.0], [0.0, 4.0], 0.625), [0.5], {}, [-0.5 - sigmoid(3.0 - 0.5)] * 2),  # within the buffer
         (
-            moved([3.0], [0.0, 4.0], 0.625), [0.5], {"safety_buffer_m": 0.1, "target_gap_m": 2.0},
+            partial(moved, [3.0], [0.0, 4.0], 0.625), [0.5], {"safety_buffer_m": 0.1, "target_gap_m": 2.0},
             [-sigmoid(-((0.5 - 0.1) / 4.0)) - sigmoid(2.0 - 0.5)] * 2,
         ),
     ],
 )  # fmt: skip
 def test_risk__by_hand(
-    states: tuple[State, State], gaps: list[float], settings: dict[str, float], value: list[float]
+    states: Callable[[], tuple[State, State]], gaps: list[float], settings: dict[str, float], value: list[float]
 ) -> None:
-    assert states[1].gaps_m[0] == near(gaps)
-    assert paid({"harm": 0.0, "risk": 1.0, **settings}, *states).terms["risk"][0] == near(value)
+    before, after = states()
+    assert after.gaps_m[0] == near(gaps)
+    assert paid({"harm": 0.0, "risk": 1.0, **settings}, before, after).terms["risk"][0] == near(value)
 
 
 @pytest.mark.parametrize(
@@ -294,8 +299,8 @@ def test_terms_of_ones_own__count_where_a_reward_says_so() -> None:
         register_term("one", one)
     register_term("gap_ahead", gap, unit="m")
     for reward in ({"harm": 1.0}, {"harm": 1.0, "one": 0.0}, "harm"):
-        assert [*paid(reward, *STRUCK).terms] == ["harm"]  # type: ignore[arg-type]
-    step = paid({"harm": 0.0, "one": 2.0, "gap_ahead": -1.0}, *STRUCK)
+        assert [*paid(reward, *struck()).terms] == ["harm"]  # type: ignore[arg-type]
+    step = paid({"harm": 0.0, "one": 2.0, "gap_ahead": -1.0}, *struck())
     assert step.reward[0] == near([2.0, 2.0 - 2.0, 2.0 - 10.25])
     settled = RewardParams(harm=1.0, terms={"one": 3.0})
     assert RewardParams(**settled.model_dump()) == settled and settled.weights["one"] == 3.0

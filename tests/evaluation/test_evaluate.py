@@ -17,6 +17,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm import EV2XBM
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.team import Team
+from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.terms import TERMS, register_term
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, UnknownName
@@ -442,34 +443,42 @@ class Wild(Careless):
         return np.full(state.n, np.nan), memory
 
 
-def refusals() -> dict[str, Any]:
-    scenario, game = open_game("paper-random")
-    drawn, mine = scenario.draw(3, 7), teams(FULL_BRAKE)
-    begun = game.reset(drawn.worlds)
-    pair = open_game(open_game("cooperation-2-five")[0])[0].draw(2, 7)
-    local, wrong = Careless(), Team("x", {1: FULL_BRAKE})
-    local.lock = threading.Lock()  # type: ignore[attr-defined]
-    return {
-        "agents = {}: must be a mapping from names to teams": lambda: evaluate_teams(drawn, {}, game),
-        "must be a mapping from names to teams, for instance": lambda: evaluate_teams(drawn, {"a": FULL_BRAKE}, game),  # type: ignore[dict-item]
-        "agents = 'full_brake'": lambda: evaluate_teams(drawn, "full_brake", game),  # type: ignore[arg-type]
-        "3 worlds of 3 vehicles; must be one or more worlds of 3 vehicles at": lambda: (
-            evaluate_teams(begun, mine, game)
-        ),
-        "worlds: 0 worlds": lambda: evaluate_teams(drawn.worlds.take(slice(0)), mine, game),
-        "2 worlds of 5 vehicles; must be": lambda: evaluate_teams(pair, mine, game),
-        "team 'x': drives vehicle_1; must drive exactly vehicle_2": lambda: evaluate_teams(drawn, {"a": wrong}, game),
-        "agent 'wild', world 0, vehicle_2 at 0.50 s: command nan m/s2": lambda: (
-            evaluate_teams(drawn, teams(Wild()), game)
-        ),
-        "this cannot be sent to another process (cannot": lambda: evaluate_teams(drawn, teams(local), game, jobs=2),
-    }  # fmt: skip
+class Local(Careless):
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
 
 
-@pytest.mark.parametrize("message", refusals())
+MINE = teams(FULL_BRAKE)
+REFUSED: dict[str, Callable[[Any, Game], object]] = {
+    "agents = {}: must be a mapping from names to teams": lambda drawn, game: evaluate_teams(drawn, {}, game),
+    "must be a mapping from names to teams, for instance": lambda drawn, game: evaluate_teams(
+        drawn, {"a": FULL_BRAKE}, game
+    ),  # type: ignore[dict-item]
+    "agents = 'full_brake'": lambda drawn, game: evaluate_teams(drawn, "full_brake", game),  # type: ignore[arg-type]
+    "3 worlds of 3 vehicles; must be one or more worlds of 3 vehicles at": lambda drawn, game: evaluate_teams(
+        game.reset(drawn.worlds), MINE, game
+    ),
+    "worlds: 0 worlds": lambda drawn, game: evaluate_teams(drawn.worlds.take(slice(0)), MINE, game),
+    "2 worlds of 5 vehicles; must be": lambda drawn, game: evaluate_teams(
+        open_game("cooperation-2-five")[0].draw(2, 7), MINE, game
+    ),
+    "team 'x': drives vehicle_1; must drive exactly vehicle_2": lambda drawn, game: evaluate_teams(
+        drawn, {"a": Team("x", {1: FULL_BRAKE})}, game
+    ),
+    "agent 'wild', world 0, vehicle_2 at 0.50 s: command nan m/s2": lambda drawn, game: evaluate_teams(
+        drawn, teams(Wild()), game
+    ),
+    "this cannot be sent to another process (cannot": lambda drawn, game: evaluate_teams(
+        drawn, teams(Local()), game, jobs=2
+    ),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
 def test_evaluation__that_is_refused(message: str) -> None:
+    scenario, game = open_game("paper-random")
     with refused(message):
-        refusals()[message]()
+        REFUSED[message](scenario.draw(3, 7), game)
 
 
 def test_failed_physics__raises_with_the_number_of_the_world() -> None:

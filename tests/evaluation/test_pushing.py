@@ -7,17 +7,18 @@ import pytest
 
 from ethbrake_marl.evaluation.pushing import driving_s, first_impact_s
 from tests.episode.lines import later, state_of
-from tests.episode.test_conduct import CLOSE, DRIVEN
+from tests.episode.test_conduct import CLOSE, after_contact
 
 near = pytest.approx
 
 
 def test_driving__counts_until_the_first_impact() -> None:
-    assert first_impact_s(CLOSE, DRIVEN).tolist() == near([1.5])
-    assert driving_s(CLOSE, DRIVEN, first_impact_s(CLOSE, DRIVEN))[0].tolist() == near([0.0, 1.0, 1.5])
-    after = later(DRIVEN, [0.0, 2.0, 1.0], 5.0)
-    assert first_impact_s(DRIVEN, after).tolist() == [4.0]
-    assert not driving_s(DRIVEN, after, DRIVEN.time_s).any()
+    driven = after_contact()
+    assert first_impact_s(CLOSE, driven).tolist() == near([1.5])
+    assert driving_s(CLOSE, driven, first_impact_s(CLOSE, driven))[0].tolist() == near([0.0, 1.0, 1.5])
+    after = later(driven, [0.0, 2.0, 1.0], 5.0)
+    assert first_impact_s(driven, after).tolist() == [4.0]
+    assert not driving_s(driven, after, driven.time_s).any()
     braked = later(CLOSE, [0.0, -2.0, 1.0], 1.0)
     assert first_impact_s(CLOSE, braked).tolist() == [1.0]
     assert driving_s(CLOSE, braked, np.ones(1))[0].tolist() == [0.0, 0.0, 1.0]

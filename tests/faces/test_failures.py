@@ -137,7 +137,7 @@ def standing(env: Any) -> str:
         getattr(base, "_np_random_seed", None),
         getattr(base, "_options", None),
     ]
-    with np.printoptions(threshold=10**9, floatmode="unique"):
+    with np.printoptions(override_repr=lambda array: f"{array.dtype} {array.shape} {array.tobytes().hex()}"):
         return repr(parts)
 
 

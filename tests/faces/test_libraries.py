@@ -136,9 +136,10 @@ def test_spec__every_argument_goes_through_json_and_makes_the_same_episode(given
     assert same.spec.max_episode_steps == alike.spec.max_episode_steps == many.spec.max_episode_steps >= len(first) - 1
 
 
-LATER = load_scenario("realistic-motorway").replace(
-    speeds_mps={"uniform": [3, 8]}, gaps_m={"uniform": [4, 12]}, alert_s={"uniform": [1, 5]}, horizon_s=9.0
-)
+LATER = {
+    "name": "later", "based_on": "realistic-motorway", "horizon_s": 9.0,
+    "speeds_mps": {"uniform": [3, 8]}, "gaps_m": {"uniform": [4, 12]}, "alert_s": {"uniform": [1, 5]},
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -48,19 +49,21 @@ def played(name: str, reward: Any = "harm") -> tuple[str, dict[str, np.ndarray]]
     return sha256.hexdigest()[:16], {"line": np.minimum(state.line[:, :PUSHED], 1e9), "rewards": sums, **observed}
 
 
-CASES: dict[str, tuple[str, Any]] = {
-    **{name: (name, "harm") for name in SHIPPED if load_scenario(name).learners},
-    **{f"paper-random-obstacle, {name}": ("paper-random-obstacle", reward) for name, reward in REWARDS.items()},
-}
+@cache
+def cases() -> dict[str, tuple[str, Any]]:
+    return {
+        **{name: (name, "harm") for name in SHIPPED if load_scenario(name).learners},
+        **{f"paper-random-obstacle, {name}": ("paper-random-obstacle", reward) for name, reward in REWARDS.items()},
+    }
 
 
 def test_every_scenario_with_learners__is_recorded() -> None:
-    assert CASES.keys() <= RECORDED.keys()
+    assert cases().keys() <= RECORDED.keys()
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [name for name in RECORDED if name.partition(",")[0] in SHIPPED])
 def test_episodes__are_those_of_the_record(name: str) -> None:
-    digest, arrays = played(*CASES[name])
+    digest, arrays = played(*cases()[name])
     with np.load(NUMBERS) as recorded:
         for key, array in arrays.items():
             np.testing.assert_allclose(array, recorded[f"{name}/{key}"], rtol=1e-9, atol=1e-9, err_msg=key)
@@ -69,7 +72,7 @@ def test_episodes__are_those_of_the_record(name: str) -> None:
 
 if __name__ == "__main__":
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
-    found = {name: played(*case) for name, case in CASES.items()}
+    found = {name: played(*case) for name, case in cases().items()}
     DIGESTS.write_text(json.dumps({name: digest for name, (digest, _) in found.items()}, indent=1) + "\n", "utf-8")
     np.savez_compressed(
         NUMBERS, **{f"{n}/{key}": array for n, (_, each) in found.items() for key, array in each.items()}

@@ -23,7 +23,7 @@ RECORDED = [  # scenario, count, who proposes, harm, bound, number of replaced p
     ("paper-random-obstacle", "total", "brake", 12287.72, 12574.41, 3000),
     ("paper-random-obstacle", "total", "ppo", 11745.30, 12440.30, 2934),
     ("cooperation-3-pair", "first", "brake", 3787.97, 4319.08, 3779),
-    ("cooperation-3-pair", "first", "ppo", 2444.67, 2512.62, 5502),
+    pytest.param("cooperation-3-pair", "first", "ppo", 2444.67, 2512.62, 5502, marks=pytest.mark.slow),
 ]
 
 

@@ -9,6 +9,8 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from functools import partialmethod
+from importlib.machinery import SourceFileLoader as Loader
 from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
@@ -22,7 +24,7 @@ from ethbrake_marl import kernel_store
 from ethbrake_marl.errors import CacheFault
 from ethbrake_marl.motion import compiling
 from ethbrake_marl.stopping import stop_on_signal
-from tests.fixtures.kernels import OWN, give_own_cache
+from tests.fixtures.kernels import OWN, give_own_cache, pytest_collection
 
 KERNELS = """\
 from ethbrake_marl.motion.compiling import kernel, large
@@ -44,23 +46,36 @@ print(kernels.answer(20.0))
 """
 
 
-def begin(folder: Path, cache: Path, *options: str) -> subprocess.Popen[str]:
+def begin(folder: Path, cache: Path, *options: str, before: str = "") -> subprocess.Popen[str]:
     path = f"{folder}{os.pathsep}{os.getcwd()}"
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": path}
-    command = [sys.executable, "-B", *options, "-c", ASK]  # -B: a change within a second would not be noticed
+    command = [sys.executable, "-B", *options, "-c", before + ASK]  # -B: a change within a second would not be noticed
     return subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 def test_machine_code__is_loaded_until_a_source_changes(tmp_path: Path) -> None:
-    def ask(factor: float, *options: str) -> list[str]:
+    def ask(factor: float) -> list[str]:
         (tmp_path / "kernels.py").write_text(KERNELS.format(factor=factor))
-        said, warned = begin(tmp_path, tmp_path / "cache", *options).communicate()
+        said, warned = begin(tmp_path, tmp_path / "cache").communicate()
         assert warned == ""
         return said.split()
 
     assert ask(2.0) == ["compiles", "True", "42.0"]
-    assert ask(2.0, "-OO") == ["42.0"]
     assert ask(3.0) == ["compiles", "False", "62.0"]  # what another kernel contains
+
+
+def test_machine_code__is_loaded_without_docstrings(ask: Callable, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    ask()
+    monkeypatch.setattr(Loader, "source_to_code", partialmethod(Loader.source_to_code, _optimize=2))
+    assert ask() == (42.0, 0, [])
+
+
+@pytest.mark.slow
+def test_python_oo__uses_the_same_machine_code(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNELS.format(factor=2.0))
+    for options, said in (((), "compiles True\n42.0\n"), (("-OO",), "42.0\n")):
+        assert begin(tmp_path, tmp_path / "cache", *options).communicate() == (said, "")
 
 
 @pytest.mark.slow
@@ -334,6 +349,25 @@ def test_suite__begins_with_the_sound_files_of_the_users_cache(ask: Callable, tm
         assert [path.name for path in kernel_store.cache_folder().iterdir()] == [sound.name]
     assert kernel_store.cache_folder().parent == user.parent / OWN
     assert {path: path.stat()[:-3] for path in user.iterdir()} == {path: old[:-3] for path, old in before.items()}
+
+
+def test_files_of_tests__call_no_kernel_when_they_are_collected() -> None:
+    halves, collection = numba.njit(lambda x: x / 2.0), pytest_collection()
+    next(collection)
+    with pytest.raises(AssertionError, match="is called at import"):
+        halves(6.0)
+    with pytest.raises(StopIteration):
+        next(collection)
+    assert halves(6.0) == 3.0
+
+
+@pytest.mark.slow
+def test_processes_of_xdist__compile_a_kernel_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "kernels.py").write_text(KERNELS.format(factor=2.0))
+    monkeypatch.setenv("PYTEST_XDIST_WORKER", "gw0")
+    begun = [begin(tmp_path, tmp_path / "cache", before="import tests.fixtures.kernels\n") for _ in range(4)]
+    said = sorted(process.communicate()[0].split() for process in begun)
+    assert said == [*[["42.0"]] * 3, ["compiles", "True", "42.0"]]
 
 
 def test_ctrl_c_while_llvm_calls_python__is_no_lost_exception() -> None:

@@ -1,4 +1,4 @@
-"""The motion of a line in small steps: a simulator that shares nothing with the package, for the tests of ``motion``.
+"""The motion of a line in small steps: a simulator that shares no formula with the package, to test ``motion``.
 
 Every step solves one convex problem (Moreau's time stepping). Bodies of mass m and speed v, free forces included, get
 the speeds x that minimise ``sum m (x - v)^2 / 2 + sum phi(x)`` where no body may be faster than a touching one in
@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+
+from ethbrake_marl.motion.compiling import _Cache
 
 TOUCH_MPS, PLASTIC_MPS = 1e-5, 0.05
 SAME_MPS = 1e-9  # closing speeds below this are rounding
@@ -36,7 +38,14 @@ class Line(NamedTuple):
     restitution: float
 
 
-@numba.njit(cache=True, no_cfunc_wrapper=True)
+def compiled(function: Any) -> Any:
+    """Compile a function, and store it by content, so that every clone of the repository uses it."""
+    kernel = numba.njit(no_cfunc_wrapper=True)(function)
+    kernel._cache = _Cache(function)
+    return kernel
+
+
+@compiled
 def rest_of_block(mass, speeds, forces, limit, h, i, j):
     """The speed that minimises the sum of the bodies i to j."""
     momentum, weight = 0.0, 0.0
@@ -73,7 +82,7 @@ def rest_of_block(mass, speeds, forces, limit, h, i, j):
     return best
 
 
-@numba.njit(cache=True, no_cfunc_wrapper=True)
+@compiled
 def regression(gaps, mass, speeds, forces, limit, h, out):
     """Speeds after a step of ``h`` (0: the speeds of a plastic impact): pools of touching bodies, front to rear."""
     n = len(speeds)
@@ -94,7 +103,7 @@ def regression(gaps, mass, speeds, forces, limit, h, out):
             out[k] = values[block]
 
 
-@numba.njit(cache=True, no_cfunc_wrapper=True)
+@compiled
 def impacts(gaps, mass, speeds, limit, restitution, book):
     """Resolve impacts, round after round; ``book`` [6, N]: hit, first harm, total, count, push, closing by forces."""
     n = len(speeds)
@@ -137,7 +146,7 @@ MASS, LIMIT, BRAKE_RATE, RELEASE_RATE = range(4)  # rows of `car`
 GAP, SPEED, FORCE, MEAN = range(4)  # rows of `now` and of what comes next; mean force of the step
 
 
-@numba.njit(cache=True, no_cfunc_wrapper=True)
+@compiled
 def build_up(now, wanted, car, h, new):
     """The forces after a step of ``h``, and their means."""
     for k in range(len(wanted)):
@@ -153,7 +162,7 @@ def build_up(now, wanted, car, h, new):
             new[MEAN, k] = 0.5 * (now[FORCE, k] + new[FORCE, k])
 
 
-@numba.njit(cache=True, no_cfunc_wrapper=True)
+@compiled
 def trial(now, wanted, car, h, new):
     """One step of ``h``; return the smallest new gap."""
     build_up(now, wanted, car, h, new)
@@ -169,7 +178,7 @@ def trial(now, wanted, car, h, new):
     return least
 
 
-@numba.njit(cache=True, no_cfunc_wrapper=True)
+@compiled
 def too_far(now, wanted, car, h, new):
     """Whether a gap closes, or a speed reaches, passes or leaves 0 or its limit, in a step of ``h``."""
     far = trial(now, wanted, car, h, new) < 0.0
@@ -181,7 +190,7 @@ def too_far(now, wanted, car, h, new):
     return far
 
 
-@numba.njit(cache=True, no_cfunc_wrapper=True)
+@compiled
 def through(now, wanted, car, restitution, duration, step_s, book):
     """Through an interval without an onset, in place; return False if there are too many steps."""
     new, time, steps = now.copy(), 0.0, 0
@@ -215,7 +224,7 @@ def through(now, wanted, car, restitution, duration, step_s, book):
     return True
 
 
-@numba.njit(cache=True, no_cfunc_wrapper=True)
+@compiled
 def part_alone(mass, speeds, forces, limit, i, j):
     """The acceleration nearest to 0 that friction and engines of the bodies i to j allow at their speeds."""
     weight, low, high = 0.0, 0.0, 0.0
@@ -231,7 +240,7 @@ def part_alone(mass, speeds, forces, limit, i, j):
     return max(low, 0.0) / weight + min(high, 0.0) / weight
 
 
-@numba.njit(cache=True, no_cfunc_wrapper=True)
+@compiled
 def pushes(now, new, car, h, book):
     """Add to ``book`` the closing speed that every contact which lasts takes up: what its two parts would do alone."""
     n = new.shape[1]

@@ -108,7 +108,7 @@ def test_at_the_alert_the_bound_is_the_cheapest_first_plan() -> None:
 # ------------------------------------------------------------------------------------------------ properties
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(
     name=st.sampled_from(list(LINES)),
     count=st.sampled_from([*COUNTS]),

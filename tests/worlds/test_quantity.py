@@ -1,5 +1,6 @@
 """Quantities by hand, and random numbers by counter."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,9 @@ from ethbrake_marl.worlds.vehicle_types import WithLoad
 
 near = pytest.approx
 ALMOST_ONE = 1.0 - 2.0**-53
-NORMAL = Normal.model_validate({"normal": {"mean": 20.0, "sd": 1.0, "low": 18.0, "high": 22.0}})
-HALF_NORMAL = Normal.model_validate({"normal": {"mean": 0.0, "sd": 1.0, "low": 0.0, "high": 9.0}})
-LOG_NORMAL = LogNormal.model_validate({"lognormal": {"median": 2.0, "sigma": 0.5, "low": 1.0, "high": 4.0}})
+NORMAL = partial(Normal.model_validate, {"normal": {"mean": 20.0, "sd": 1.0, "low": 18.0, "high": 22.0}})
+HALF_NORMAL = partial(Normal.model_validate, {"normal": {"mean": 0.0, "sd": 1.0, "low": 0.0, "high": 9.0}})
+LOG_NORMAL = partial(LogNormal.model_validate, {"lognormal": {"median": 2.0, "sigma": 0.5, "low": 1.0, "high": 4.0}})
 
 
 @pytest.mark.parametrize(
@@ -38,6 +39,7 @@ LOG_NORMAL = LogNormal.model_validate({"lognormal": {"median": 2.0, "sigma": 0.5
     ids=lambda value: type(value).__name__,
 )
 def test_quantity__by_hand(quantity: Any, u: list[float], drawn: Any, bounds: tuple[float, float]) -> None:
+    quantity = quantity() if callable(quantity) else quantity
     assert values(quantity, np.array(u)).tolist() == drawn
     assert support(quantity) == bounds
 

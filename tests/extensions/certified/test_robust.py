@@ -88,7 +88,7 @@ def test_parse__reads_entries_between_commas_or_colons() -> None:
 # ------------------------------------------------------------------------------------------------ the shield
 
 
-@settings(max_examples=12)
+@settings(max_examples=7)
 @given(
     intervals=st.sampled_from(list(UNCERTAINTIES)),
     count=st.sampled_from(["first", "total"]),

@@ -1,5 +1,7 @@
 """The front of a list: no constant, agent or point of other weights is better, and a batch changes nothing."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -24,14 +26,18 @@ from ethbrake_marl.worlds.describe import clusters_of, columns_of
 from tests.evaluation.lines import recorded
 
 PAPER = eb.load_scenario("paper-random")
-WORLDS = PAPER.sample(20, 7)
 WEIGHTS = np.concatenate([weight_grid(3, 1), np.ones((1, 3)), corners(3)])
 AGENTS = ["e_v2x_bm", "vine-paper", "vine-preference"]
 
 
+@cache
+def sampled() -> eb.State:
+    return PAPER.sample(20, 7)
+
+
 @pytest.fixture(scope="module")
 def front() -> Front:
-    return search_front(PAPER, WORLDS, WEIGHTS, count="first", budget=300, agents=AGENTS)
+    return search_front(PAPER, sampled(), WEIGHTS, count="first", budget=300, agents=AGENTS)
 
 
 def preferring(row: np.ndarray) -> eb.Scenario:
@@ -56,7 +62,7 @@ def test_means__golden(front: Front) -> None:
 
 
 def test_point__is_never_beaten_under_its_weights_by_another_point_a_constant_or_an_agent(front: Front) -> None:
-    problem = problem_of(eb.open_game(PAPER)[1], WORLDS)
+    problem = problem_of(eb.open_game(PAPER)[1], sampled())
     grid = problem.even_grid(101)
     constants = [problem.follow(problem.constant(grid[:, [q]])).borne_harm("first") for q in range(101)]
     others = [*front.borne["first"], *constants, *(each for borne in front.agents.values() for each in borne["first"])]
@@ -91,12 +97,12 @@ def test_agents__that_do_not_observe_the_weights_drive_once() -> None:
 
 
 def test_equal_weights__are_as_good_as_the_tables(front: Front) -> None:
-    known = best_stored(problem_of(eb.open_game(PAPER)[1], WORLDS), "first")[0]
+    known = best_stored(problem_of(eb.open_game(PAPER)[1], sampled()), "first")[0]
     assert (front.borne["first"][3].sum(axis=1) <= known + 1e-9).all()
 
 
 def test_honest_cost__is_the_default_and_leaves_less_of_it_than_the_papers_rules(front: Front) -> None:
-    mine = search_front(PAPER, WORLDS.take(np.arange(6)), WEIGHTS[[3]], budget=300, agents=["universal"])
+    mine = search_front(PAPER, sampled().take(np.arange(6)), WEIGHTS[[3]], budget=300, agents=["universal"])
     cost, papers, universal = (each["honest"][0].sum(axis=1) for each in (
         mine.borne, {"honest": front.borne["honest"][[3], :6]}, mine.agents["universal"]
     ))  # fmt: skip
@@ -113,7 +119,7 @@ def test_front__does_not_depend_on_the_other_worlds_or_threads(front: Front, mon
     monkeypatch.setattr("ethbrake_marl.extensions.cooperation.front.FRONT_CHUNK", 2)
     some, heard = np.array([3, 17, 11]), []
     again = search_front(
-        PAPER, WORLDS.take(some), WEIGHTS, count="first", budget=300, agents=AGENTS, threads=3,
+        PAPER, sampled().take(some), WEIGHTS, count="first", budget=300, agents=AGENTS, threads=3,
         on_progress=lambda *each: heard.append(each),
     )  # fmt: skip
     for count in ("first", "total"):
@@ -123,12 +129,12 @@ def test_front__does_not_depend_on_the_other_worlds_or_threads(front: Front, mon
 
 
 def test_maximin__is_at_least_as_good_for_whoever_bears_most_as_every_point(front: Front) -> None:
-    found = least_largest(PAPER, WORLDS, front, budget=300)["first"].max(axis=1)
+    found = least_largest(PAPER, sampled(), front, budget=300)["first"].max(axis=1)
     assert (found <= front.borne["first"].max(axis=2).min(axis=0)).all()
     assert found.mean() < 0.99 * front.borne["first"].max(axis=2).min(axis=0).mean()
 
 
-@pytest.mark.parametrize("count", ["first", "honest"])
+@pytest.mark.parametrize("count", ["honest", pytest.param("first", marks=pytest.mark.slow)])
 def test_two_learners__are_never_worse_than_one_nor_than_agents_that_drive_one_or_both(count: str) -> None:
     pair, rows, heard = eb.load_scenario("cooperation-3-pair"), WEIGHTS[[1, 3, 6]], []
     agents = ["e_v2x_bm", "universal", "vine-pair"]

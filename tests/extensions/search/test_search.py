@@ -1,5 +1,7 @@
 """Searches: golden values, an optimum by hand, never worse than what they begin with."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -19,14 +21,11 @@ from ethbrake_marl.extensions.search.search import (
     search_profiles,
 )
 from ethbrake_marl.extensions.search.tables import BestHarmTable
-from ethbrake_marl.motion.layout import DROVE, MOVING
+from ethbrake_marl.motion.layout import DROVE, MOVING, Floats
 from tests.extensions.proofs.worlds import worlds
 from tests.refused import refused
 
 SCENARIO, GAME = eb.open_game("paper-random")
-WORLDS = SCENARIO.sample(6, seed=7)
-PROBLEM = problem_of(GAME, WORLDS)
-STEADY = np.full((6, int(PROBLEM.last_step.max())), -4.0)
 
 # harms in m2/s2, to the last bit: scenario, objective, count, the first six worlds of seed 7
 GOLDEN = [
@@ -58,6 +57,21 @@ GOLDEN = [
 ]  # fmt: skip
 
 
+@cache
+def sampled() -> eb.State:
+    return SCENARIO.sample(6, seed=7)
+
+
+@cache
+def paper() -> Problem:
+    return problem_of(GAME, sampled())
+
+
+@cache
+def steady() -> Floats:
+    return np.full((6, int(paper().last_step.max())), -4.0)
+
+
 def grid(problem: Problem) -> Profiles:
     return problem.constant(problem.even_grid(29))
 
@@ -73,7 +87,7 @@ def test_search__golden(name: str, objective: str, count: str, harm: list[float]
 def test_search__of_one_vehicle_first_then_the_line_spares_both() -> None:
     harm, line = {}, {}
     for objective in ("vehicle_3", "first:vehicle_3,then:total"):
-        problem = problem_of(GAME, WORLDS, objective=objective)
+        problem = problem_of(GAME, sampled(), objective=objective)
         last = problem.follow(search_profiles(problem, [grid(problem)], budget=1000)[0])
         harm[objective], line[objective] = last.borne_harm()[:, 2], last.harm()
     assert not harm["first:vehicle_3,then:total"].any() and not harm["vehicle_3"].any()
@@ -82,14 +96,14 @@ def test_search__of_one_vehicle_first_then_the_line_spares_both() -> None:
 
 
 def test_search__depends_on_the_seed_and_on_no_other_world_or_thread_and_is_never_worse_than_what_it_is_given() -> None:
-    profiles, values = search_profiles(PROBLEM, [grid(PROBLEM)], budget=1000)
-    few = PROBLEM.take([5, 1])
+    profiles, values = search_profiles(paper(), [grid(paper())], budget=1000)
+    few = paper().take([5, 1])
     same = search_profiles(few, [grid(few)], budget=1000, threads=2)[1]["first"]
     assert same.tolist() == values["first"][[5, 1]].tolist()
-    other = search_profiles(PROBLEM, [grid(PROBLEM)], budget=1000, seed=1)[0]
+    other = search_profiles(paper(), [grid(paper())], budget=1000, seed=1)[0]
     assert other.commands_mps2.tobytes() != profiles.commands_mps2.tobytes()
     assert profiles.ends.shape[1] > MOST_PHASES
-    assert (search_profiles(PROBLEM, [grid(PROBLEM), profiles], budget=5)[1]["first"] <= values["first"]).all()
+    assert (search_profiles(paper(), [grid(paper()), profiles], budget=5)[1]["first"] <= values["first"]).all()
 
 
 @pytest.mark.parametrize(("bodies", "harm"), [([2], 200.0), ([1], 0.0), ([1, 2], 0.0)])
@@ -125,7 +139,7 @@ def test_best_harm__keeps_for_each_count_the_better_of_both_searches() -> None:
 
 def test_search_list__continues_only_a_search_in_the_same_physics(tmp_path, request) -> None:
     def searched() -> int:
-        search_list(GAME, WORLDS, chunks=tmp_path / "chunks", budget=30, threads=1)
+        search_list(GAME, sampled(), chunks=tmp_path / "chunks", budget=30, threads=1)
         return len([*(tmp_path / "chunks").iterdir()])
 
     assert [searched(), searched()] == [1, 1]
@@ -147,7 +161,7 @@ def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_
 
 @pytest.mark.parametrize("stepwise", [False, True])
 def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool) -> None:
-    problem, values = PROBLEM.with_count("honest"), np.empty(1)
+    problem, values = paper().with_count("honest"), np.empty(1)
     driving, random = problem.constant(problem.bounds[:, np.newaxis, :, 1]), random_states(problem.identity, 0)
     last = problem.follow(driving)
     assert last.line[:, MOVING].any(axis=1).all()
@@ -159,16 +173,16 @@ def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool
 
 @pytest.mark.parametrize("objective", ["own", "weighted:1,4,2", "maximin"])
 def test_value__of_the_honest_cost_of_vehicles_is_the_amount_of_the_objective(objective: str) -> None:
-    problem = problem_of(GAME, WORLDS, count="honest", objective=objective)
+    problem = problem_of(GAME, sampled(), count="honest", objective=objective)
     last = problem.follow(problem.constant(problem.bounds[:, np.newaxis, :, 1]))
     assert last.line[:, MOVING].any(axis=1).all() and last.line[:, DROVE].any(axis=1).all()
     assert problem.value(last) == pytest.approx(amounts(objectives_of(objective, 3), None, last, "honest")[:, 1])
 
 
 def test_extremes__are_better_than_constants() -> None:
-    _, constants, extremes = starting_profiles(PROBLEM, WORLDS)
+    _, constants, extremes = starting_profiles(paper(), sampled())
     least = [
-        PROBLEM.take(np.repeat(np.arange(6), number)).values(each)["first"].reshape(6, number).min(axis=1)
+        paper().take(np.repeat(np.arange(6), number)).values(each)["first"].reshape(6, number).min(axis=1)
         for each, number in ((extremes, KEPT_PROFILES), (constants, 29))
     ]
     assert least[0] == pytest.approx([5.600547589835766, 20.05159792, 0.0, 0.0, 0.0, 14.29558235], abs=1e-8)
@@ -176,11 +190,11 @@ def test_extremes__are_better_than_constants() -> None:
 
 
 def test_refine__golden_and_never_worse() -> None:
-    commands, harm = refine(PROBLEM, STEADY, budget=300)
+    commands, harm = refine(paper(), steady(), budget=300)
     assert harm.tolist() == [5.600547589835766, 27.88218872437303, 0.0, 0.0, 0.0, 21.763164041835232]
-    before = PROBLEM.values(Profiles.of_steps(STEADY[:, :, np.newaxis], PROBLEM.last_step))["first"]
-    assert (harm <= before).all() and (STEADY == -4.0).all()
-    assert (refine(PROBLEM, commands, budget=1)[1] <= harm).all()
+    before = paper().values(Profiles.of_steps(steady()[:, :, np.newaxis], paper().last_step))["first"]
+    assert (harm <= before).all() and (steady() == -4.0).all()
+    assert (refine(paper(), commands, budget=1)[1] <= harm).all()
 
 
 def test_profiles__compact_short_and_joined() -> None:
@@ -198,36 +212,36 @@ def test_search_list__goes_on_where_it_stopped(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("ethbrake_marl.extensions.search.best_harm.SEARCH_CHUNK", 4)
     done: list[tuple[int, int]] = []
     options = {"budget": 60, "threads": 1, "chunks": tmp_path}
-    table = search_list(GAME, WORLDS, on_progress=lambda *each: done.append(each), **options)
-    assert done == [(4, 6), (6, 6)] and table.identity.tolist() == PROBLEM.identity.tolist()
-    assert table.harm["total"].tolist() == best_harm(GAME, WORLDS, budget=60, threads=1).harm["total"].tolist()
+    table = search_list(GAME, sampled(), on_progress=lambda *each: done.append(each), **options)
+    assert done == [(4, 6), (6, 6)] and table.identity.tolist() == paper().identity.tolist()
+    assert table.harm["total"].tolist() == best_harm(GAME, sampled(), budget=60, threads=1).harm["total"].tolist()
     first, second = sorted(tmp_path.iterdir())
     second.unlink()
     before = first.stat().st_mtime_ns
-    assert search_list(GAME, WORLDS, **options).content() == table.content() and first.stat().st_mtime_ns == before
-    assert search_list(GAME, WORLDS, **{**options, "budget": 61}).header["budget"] == 61
+    assert search_list(GAME, sampled(), **options).content() == table.content() and first.stat().st_mtime_ns == before
+    assert search_list(GAME, sampled(), **{**options, "budget": 61}).header["budget"] == 61
     assert len([*tmp_path.iterdir()]) == 4
-    again = search_list(GAME, WORLDS, known_table=table, budget=1).harm["total"]
+    again = search_list(GAME, sampled(), known_table=table, budget=1).harm["total"]
     assert (again <= table.harm["total"]).all()
     team = eb.Team("best_harm", {2: eb.make_agent("best_harm", scenario=SCENARIO)})  # drives shipped profiles
-    driven = eb.evaluate(WORLDS, {"best": team}, scenario=SCENARIO)["best"]["first_impact_harm"]
-    better = search_list(GAME, WORLDS, teams=[team], budget=1).harm["first"]
+    driven = eb.evaluate(sampled(), {"best": team}, scenario=SCENARIO)["best"]["first_impact_harm"]
+    better = search_list(GAME, sampled(), teams=[team], budget=1).harm["first"]
     assert (better <= driven).all() and (driven < table.harm["first"] - 0.01).any()
     with refused("holds none of the 6 worlds; use the scenario, seed and vehicles for which it was made"):
         search_list(GAME, SCENARIO.sample(6, seed=8), known_table=table)
 
 
 REFUSED = {
-    "budget = 0: must be a whole number": lambda: search_profiles(PROBLEM, [grid(PROBLEM)], budget=0),
-    "count = 'best': must be 'first', 'total' or 'honest'": lambda: problem_of(GAME, WORLDS, count="best"),
-    "threads = 0: must be a whole number": lambda: search_profiles(PROBLEM, [grid(PROBLEM)], budget=9, threads=0),
+    "budget = 0: must be a whole number": lambda: search_profiles(paper(), [grid(paper())], budget=0),
+    "count = 'best': must be 'first', 'total' or 'honest'": lambda: problem_of(GAME, sampled(), count="best"),
+    "threads = 0: must be a whole number": lambda: search_profiles(paper(), [grid(paper())], budget=9, threads=0),
     "counts = ('first', 'first'): must be some of first, total, honest, each once": lambda: best_harm(
-        GAME, WORLDS, counts=("first", "first")
+        GAME, sampled(), counts=("first", "first")
     ),
     "vehicles [2, 3]: plans are searched for one controlled vehicle": lambda: refine(
-        problem_of(GAME, WORLDS, [2, 3]), STEADY, budget=1
+        problem_of(GAME, sampled(), [2, 3]), steady(), budget=1
     ),
-    "profiles: command -50 m/s2 of vehicle_2": lambda: refine(PROBLEM, STEADY - 46.0, budget=5),
+    "profiles: command -50 m/s2 of vehicle_2": lambda: refine(paper(), steady() - 46.0, budget=5),
 }
 
 
@@ -241,10 +255,10 @@ def test_search__names_the_worlds_that_cannot_be_simulated(monkeypatch) -> None:
     here = "ethbrake_marl.extensions.search."
     monkeypatch.setattr(here + "search.search_world", lambda world, *given: None)
     with refused("world 4: no profile could be simulated", PhysicsError):
-        search_profiles(PROBLEM, [grid(PROBLEM)], budget=50)
+        search_profiles(paper(), [grid(paper())], budget=50)
     monkeypatch.setattr(here + "search.improve", lambda *given: (np.inf, 0))
     with refused("world 4: the given commands cannot be simulated", PhysicsError):
-        refine(PROBLEM, STEADY, budget=5)
+        refine(paper(), steady(), budget=5)
     monkeypatch.setattr(here + "pricing.follow_worlds", lambda *given: given[-1].__setitem__(4, True))
     with refused("world 4: its profile could not be simulated", PhysicsError):
-        PROBLEM.follow(PROBLEM.coasting())
+        paper().follow(paper().coasting())

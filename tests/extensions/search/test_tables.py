@@ -3,6 +3,7 @@
 import io
 import json
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,12 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.extensions.search.best_harm import best_harm
-from ethbrake_marl.extensions.search.pricing import problem_of
+from ethbrake_marl.extensions.search.pricing import Problem, problem_of
 from ethbrake_marl.extensions.search.tables import BestHarmTable, best_stored, outdated_tables, shipped_tables
 from ethbrake_marl.motion.digest import physics_digest
 from tests.refused import refused
 
 SCENARIO, GAME = eb.open_game("paper-random")
-WORLDS = SCENARIO.sample(8, seed=11)
-PROBLEM = problem_of(GAME, WORLDS)
 
 MEANS = {  # harm of docs/results/best-harm.md, m2/s2: first-impact, total
     "cooperation-2-blocked": (16.609, 16.718), "cooperation-2-five": (11.554, 11.640),
@@ -31,9 +30,19 @@ MEANS = {  # harm of docs/results/best-harm.md, m2/s2: first-impact, total
 }  # fmt: skip
 
 
+@cache
+def sampled() -> eb.State:
+    return SCENARIO.sample(8, seed=11)
+
+
+@cache
+def paper() -> Problem:
+    return problem_of(GAME, sampled())
+
+
 @pytest.fixture(scope="module")
 def table() -> BestHarmTable:
-    return best_harm(GAME, WORLDS, budget=100, threads=1)
+    return best_harm(GAME, sampled(), budget=100, threads=1)
 
 
 @pytest.mark.parametrize("name", MEANS)
@@ -67,13 +76,13 @@ def test_shipped__are_not_used_under_another_impact_law(other_law: str) -> None:
 
 
 def test_best_known__of_no_table_is_infinite_and_coasting() -> None:
-    harm, profiles = best_stored(PROBLEM, "first")
+    harm, profiles = best_stored(paper(), "first")
     assert np.isinf(harm).all() and not profiles.commands_mps2.any()
-    PROBLEM.check(profiles)
+    paper().check(profiles)
 
 
 def test_stored__where_a_table_holds_some_of_the_worlds(table: BestHarmTable) -> None:
-    problem = problem_of(GAME, eb.State.join([SCENARIO.sample(2, seed=12), WORLDS.take([5])]))
+    problem = problem_of(GAME, eb.State.join([SCENARIO.sample(2, seed=12), sampled().take([5])]))
     harm, profiles = table.stored(problem, "total")
     assert harm.tolist() == [np.inf, np.inf, table.harm["total"][5]]
     assert not profiles.commands_mps2[:2].any() and problem.values(profiles)["total"][2] == harm[2]
@@ -84,7 +93,7 @@ def test_save__and_load_are_the_same(table: BestHarmTable, tmp_path: Path) -> No
     again = BestHarmTable.load(tmp_path / "t.npz")
     assert again.content() == table.content() and again.header == table.header
     for count in ("first", "total"):
-        assert PROBLEM.values(again.profiles[count])[count].tolist() == table.harm[count].tolist()
+        assert paper().values(again.profiles[count])[count].tolist() == table.harm[count].tolist()
 
 
 def changed(**arrays: Callable[[Any], Any]) -> Callable[[BestHarmTable], bytes]:
