@@ -124,12 +124,12 @@ def ranged(high: float, fallback: str = "") -> LearnedAgent:
 
 def test_learned_agent__counts_decisions_outside_its_range_also_behind_a_shield() -> None:
     for agent, share in ((ranged(0.0), 1.0), (ranged(99.0), 0.0)):
-        last = play_to_end(GAME, WORLDS, Team("mine", {2: agent}))
+        last = play_to_end(GAME, sampled(), Team("mine", {2: agent}))
         assert (last.memories[2].outside == share * last.steps).all() and last.steps.min() > 5
-        shielded = play_to_end(GAME, WORLDS, Team("mine", {2: agent}, StepShield({2: agent})))
+        shielded = play_to_end(GAME, sampled(), Team("mine", {2: agent}, StepShield({2: agent})))
         assert (shielded.memories["shield"].agents[0].outside == share * shielded.steps).all()
         for shield in (None, StepShield({2: agent}), EpisodeShield({2: agent})):
-            result = evaluate(WORLDS, {"mine": Team("mine", {2: agent}, shield)}, scenario=PAPER)
+            result = evaluate(sampled(), {"mine": Team("mine", {2: agent}, shield)}, scenario=PAPER)
             assert (result["mine"]["outside"] == share).all()
     assert harms(ranged(0.0)) == harms(LearnedAgent(PPO.with_range(None)))
 
@@ -137,7 +137,7 @@ def test_learned_agent__counts_decisions_outside_its_range_also_behind_a_shield(
 def test_learned_agent__follows_its_fallback_outside_only() -> None:
     assert actions(ranged(0.0, "front_1.acceleration")) == pytest.approx([-0.6] * 12)  # it brakes at 6 m/s2
     assert actions(ranged(99.0, "front_1.acceleration")) == actions(LearnedAgent(PPO))
-    values = PPO.observation.observe(GAME.reset(WORLDS), np.array([2]), 0.1)[:, 0]
+    values = PPO.observation.observe(GAME.reset(sampled()), np.array([2]), 0.1)[:, 0]
     middle = float(np.sort(np.abs(values), axis=1)[:, -3].mean()) - 0.05
     mixed = ranged(middle, "front_1.acceleration")
     outside = mixed.policy.manifest.training_range.is_outside(values)
