@@ -269,6 +269,8 @@ def run(world, commands, step, horizon, out):  # noqa: C901
         now += wait
     if out[FIRST] == 2.0 or out[TIME_2] == inf:
         out[DROVE_2] = 0.0
+        if out[FIRST] in (0.0, 1.0):
+            out[PUSH] = push[int(out[FIRST])]
     out[CORE] = harm + PRICE * (push[0] + push[1])
     out[COST] = out[CORE] + PRICE * drove + v[1] * v[1] + v[2] * v[2] + v[0] * v[0]
 

@@ -220,6 +220,21 @@ def reached_by_rear(at, gap, speed, u, rear_speed, onset, duration):
 
 
 @large
+def third_at_rear(at, gap, speed, rear_speed, onset, duration, thrown):
+    """Least cost (m2/s2) of a third contact with the rear vehicle and of the driving before it.
+
+    ``thrown``: as for ``third_cost``. Other arguments: as for ``reached_by_rear``.
+    """
+    free = third_cost(at, reached_by_rear(at, gap, speed, at[U_F], rear_speed, onset, duration), thrown)
+    least = held = third_cost(at, reached_by_rear(at, gap, speed, 0.0, rear_speed, onset, duration), thrown)
+    part = (held - free) / (PRICE * DRIVES)
+    for k in range(DRIVES if held > free else 0):  # it drives so many parts, or a part of one more
+        closing = reached_by_rear(at, gap, speed + (k + 1) * part, 0.0, rear_speed, onset, duration)
+        least = min(least, PRICE * k * part + max(third_cost(at, closing, thrown), free))
+    return least
+
+
+@large
 def rear_chains(at, box, until_end):
     """Lower bound (m2/s2) on the honest cost of the chains of a box that begin at the rear vehicle.
 
@@ -227,7 +242,7 @@ def rear_chains(at, box, until_end):
     """
     early, late, soft, hard = box[EARLY], box[LATE], box[SOFT], box[HARD]
     since, until = max(box[SINCE], early), box[UNTIL]
-    mu, nu, bounce, a_f, u = at[REAR_SHARE], at[FRONT_SHARE], at[BOUNCE], at[A_F], at[U_F]
+    mu, nu, bounce, a_f = at[REAR_SHARE], at[FRONT_SHARE], at[BOUNCE], at[A_F]
     v_r, way = follower(at, early)
     place = way - at[GAP_R] - OUTWARD
     kick = (1.0 - mu) * (1.0 + bounce) * hard
@@ -285,15 +300,7 @@ def rear_chains(at, box, until_end):
     # the third contact
     speed = first_v + slowing(nu, bounce, box[SOFT_2], box[HARD_2]) + OUTWARD
     thrown = nu * (1.0 + bounce) * box[HARD_2] if hard > TOUCH_MPS else math.inf
-    left = max(at[ONSET_R] - until, 0.0)
-    free = reached_by_rear(at, gap, speed, u, slow_end, left, until_end - until)
-    held = reached_by_rear(at, gap, speed, 0.0, slow_end, left, until_end - until)
-    least, most = third_cost(at, free, thrown), third_cost(at, held, thrown)
-    part, third = (most - least) / (PRICE * DRIVES), most
-    for k in range(DRIVES if most > least else 0):  # it drives so many more parts, or fewer than one more
-        held = reached_by_rear(at, gap, speed + (k + 1) * part, 0.0, slow_end, left, until_end - until)
-        third = min(third, PRICE * k * part + max(third_cost(at, held, thrown), least))
-    return cost + third
+    return cost + third_at_rear(at, gap, speed, slow_end, max(at[ONSET_R] - until, 0.0), until_end - until, thrown)
 
 
 @large

@@ -12,8 +12,17 @@ import ethbrake_marl as eb
 from ethbrake_marl.episode.step import hold_commands
 from ethbrake_marl.evaluation.resimulation import advance_worlds
 from ethbrake_marl.extensions.proofs import line as row
+from ethbrake_marl.extensions.proofs.avoidability import FRONT, REASON, VERDICT, decide
 from ethbrake_marl.extensions.proofs.chain_search import chain_bound, triple_contact
-from ethbrake_marl.extensions.proofs.chains import BOX_ROWS, chain_cost, cruise, price_of, slowing, third_cost
+from ethbrake_marl.extensions.proofs.chains import (
+    BOX_ROWS,
+    chain_cost,
+    cruise,
+    price_of,
+    slowing,
+    third_at_rear,
+    third_cost,
+)
 from ethbrake_marl.extensions.proofs.lower_bound import last_rest, lower_bound
 from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable
 from ethbrake_marl.motion.impact import TOUCH_MPS
@@ -56,7 +65,9 @@ def random_plans(worlds, rng, decisions=24):
     softly = -worlds[:, sim.A_0] - closing**2 / (2.0 * worlds[:, sim.GAP_0])
     touch = (rng.random(n) < 0.125) & (closing > 0) & (softly > -worlds[:, sim.A_1])
     until = np.where(touch, np.ceil(2.0 * worlds[:, sim.GAP_0] / np.maximum(closing, 1e-3) / STEP_S), 0.0)
-    return np.where(np.arange(decisions) < until[:, np.newaxis], softly[:, np.newaxis], plan)
+    plan = np.where(np.arange(decisions) < until[:, np.newaxis], softly[:, np.newaxis], plan)
+    plan[:, -1] = -worlds[:, sim.A_1]  # in the end it brakes to rest
+    return plan
 
 
 @numba.njit
@@ -93,10 +104,17 @@ def covered(worlds):
     return held & (worlds[:, sim.A_1] >= np.maximum(worlds[:, sim.A_0], worlds[:, sim.A_2]))
 
 
+def unavoidable(at):
+    """Whether contact with a neighbour is unavoidable, and none comes before the vehicle may act."""
+    verdict = np.zeros(VERDICT)
+    decide(at, verdict)
+    return verdict[REASON] >= FRONT
+
+
 def box_around(record, rng, size):
     """A box that contains the chain of this record: its ranges are up to ``size`` times as wide as usual."""
     first = [record[sim.TIME], record[sim.CLOSING], record[sim.PUSH] + record[sim.GAINED]]
-    centre = np.array([*first, record[sim.TIME_2], record[sim.CLOSING_2]])
+    centre = np.array([*first, record[sim.TIME_2], record[sim.CLOSING_2]])  # without a second contact: infinite
     lower, upper = rng.uniform(0, size, (2, 5)) * np.array([0.2, 1.0, 1.0, 0.2, 1.0])
     low, high = np.maximum(centre - lower, 0.0), centre + upper
     if record[sim.CLOSING] <= TOUCH_MPS:
@@ -155,10 +173,10 @@ def test_box__is_never_above_the_cost_of_a_chain_in_it(size):
     worlds = random_worlds(20_000, rng)
     records, claims = played(worlds, random_plans(worlds, rng))
     chosen = covered(worlds) & (records[:, sim.FIRST] >= 0) & (records[:, sim.FIRST] < 2)
-    for k in np.flatnonzero(chosen & np.isfinite(records[:, sim.TIME_2])):
+    for k in np.flatnonzero(chosen):
         record = records[k]
         bound = chain_cost(record[sim.FIRST], row_of(worlds[k]), box_around(record, rng, size), HORIZON_S)
-        cost = record[sim.CORE] + 10 * (record[sim.DROVE] + record[sim.DROVE_2])
+        cost = record[sim.COST]
         assert bound <= cost + 1e-6 * (1 + cost)
         near, tried = near + (bound > 0.99 * claims[k, 0] - 0.01), tried + 1
     assert tried > 3000 and (near > 0.95 * tried or size > 0.1)  # a small box says what the theorem says
@@ -170,6 +188,11 @@ def test_pieces__by_hand():
     # 6 m/s of closing, of which an impact from behind threw 2: 36 + 10 * 1.1 * 4; below 0.05 m/s nothing bounces
     assert third_cost(at, 6.0, 2.0) == pytest.approx(36 + 44)
     assert third_cost(at, 0.04, 0.0) == pytest.approx(0.0016 + 0.4)
+    # 5 m/s faster, 9 / 8 m behind, 4 m/s2: 25 - 9 = 4^2; driving 2 m/s away at once avoids it for 20
+    at[row.A_R], at[row.LIMIT_F], at[row.U_F] = 4.0, 40.0, 0.0
+    assert third_at_rear(at, 1.125, 10.0, 15.0, 0.0, 9.0, 0.0) == pytest.approx(16 + 44)
+    at[row.U_F] = 1000.0
+    assert 12 < third_at_rear(at, 1.125, 10.0, 15.0, 0.0, 9.0, 0.0) <= 20
     # after a touch an impact of 3 m/s pushes 3.3 m/s for 9; beyond 5.5 m/s of impact the push is cheaper
     assert [price_of(at, 3.3, w) for w in (0.0, 1.0)] == pytest.approx([9, 33])
     assert price_of(at, 10.0, 0.0) == pytest.approx(5.5**2 + 10 * (10 - 1.1 * 5.5))
@@ -218,13 +241,14 @@ def attacked(worlds, horizons, tries, rng, known=None):
 
 def test_bound__no_plan_is_below_it_in_random_worlds():
     rng, boxes, memory = np.random.default_rng(4), np.empty((BOX_ROWS, 20_000)), np.empty((2, BOX_ROWS))
-    worlds = random_worlds(150, rng)
+    worlds = random_worlds(400, rng)
     worlds = worlds[covered(worlds)]
+    worlds = worlds[[unavoidable(row_of(world)) for world in worlds]]
     rows = np.array([row_of(world) for world in worlds])
     bounds = np.array([chain_bound(at, HORIZON_S, boxes, memory) for at in rows])
     inside = np.array([last_rest(at) < HORIZON_S for at in rows])
     least = attacked(worlds[inside], np.full(len(worlds), HORIZON_S), 80, rng)
-    assert (bounds > 1).mean() > 0.3 and (least >= bounds[inside]).all()
+    assert (bounds > 1).sum() > 50 and (least >= bounds[inside]).all()
 
 
 LISTS = {"paper-random": 0.92, "paper-random-brake-only": 0.93}
