@@ -16,8 +16,11 @@ from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import hold_commands
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.proofs.avoidability import FRONT, avoidability, largest_behind, spare_gap
+from ethbrake_marl.extensions.proofs.avoidability import FRONT, avoidability
 from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, least_contact_harm
+from ethbrake_marl.extensions.proofs.chain_search import BOXES, chain_bound
+from ethbrake_marl.extensions.proofs.chains import BOX_ROWS
+from ethbrake_marl.extensions.proofs.first_contacts import GRAZE_S, last_meeting, outer_contact, rear_times
 from ethbrake_marl.extensions.proofs.followers import after
 from ethbrake_marl.extensions.proofs.line import (
     A_F,
@@ -26,16 +29,13 @@ from ethbrake_marl.extensions.proofs.line import (
     FRONT_FIRST,
     GAP_L,
     GAP_R,
-    HALVINGS,
     LARGE,
-    LIMIT_F,
     ONSET_F,
     ONSET_R,
     REAR_FIRST,
     TIME_STEP,
     TOUCH_HARM,
     TOUCHING_M,
-    U_F,
     V_F,
     V_L,
     V_R,
@@ -44,16 +44,13 @@ from ethbrake_marl.extensions.proofs.line import (
 from ethbrake_marl.extensions.proofs.meetings import (
     before_rear,
     behind_leader,
-    braking_to_rear,
     driving_first,
     gentlest_front,
     meet_front,
-    meet_rear,
     rest_of_rear,
     stays_ahead,
-    stays_behind,
 )
-from ethbrake_marl.extensions.proofs.plans import braking, walk
+from ethbrake_marl.extensions.proofs.plans import braking
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.interval import solo
 from ethbrake_marl.motion.layout import LIMIT, Bools, Floats
@@ -66,7 +63,6 @@ BOUND_EPS = 2.0**12
 EPS = 2.0**-52
 
 _AT_ONCE = 100  # worlds that a thread bounds together
-_GRAZE_S = 1e-3  # largest rounding error in the time of a contact at closing speed 0
 _PARTS = 8  # number of parts into which the times of soft contacts are divided
 
 FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
@@ -117,47 +113,6 @@ def rear_bound(at):
 
 
 @large
-def last_first(kind, at, first, last):
-    """Latest time (s), at most ``last``, at which the first contact can be with the neighbour ``kind``.
-
-    Found by bisection, from the time ``first`` (s), at which such a contact is possible. The later the contact with the
-    front vehicle, the shorter the drive before it, and the nearer the rear vehicle comes. The later the contact with
-    the rear vehicle, the shorter the braking before it, and the nearer the front vehicle comes. ``kind``, ``at``:
-    package ``proofs``.
-    """
-    time = last
-    for _ in range(HALVINGS + 1):
-        if kind == FRONT_FIRST:
-            is_first = stays_ahead(at, gentlest_front(at, time)[1], time)
-        else:
-            is_first = stays_behind(at, braking_to_rear(at, time), time)
-        if is_first:
-            first = time
-        else:
-            last = time
-        if first == last:
-            break
-        time = 0.5 * (first + last)
-    return first
-
-
-@large
-def last_meeting(at, first):
-    """Latest time (s) of a contact with the front vehicle, and latest time (s) at which it can be the first contact.
-
-    The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
-    speed. ``first`` is the earliest time (s) of a contact with the front vehicle. ``at``: one world (columns: file
-    ``line``).
-    """
-    touches = spare_gap(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F]) >= 0.0
-    last = meet_front(at, 0.0)
-    if touches:
-        last = largest_behind(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F], at[U_F], at[LIMIT_F])[1]
-    end = last_first(FRONT_FIRST, at, first, last)
-    return last, end, touches and end == last
-
-
-@large
 def soft_harm(kind, at, early, late, floor, best):
     """Lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late`` (s).
 
@@ -170,17 +125,6 @@ def soft_harm(kind, at, early, late, floor, best):
         best = min(best, soft * soft + max(after(kind, at, early, late, hard, late, 0.0), floor))
         soft = hard
     return best
-
-
-@kernel
-def outer_contact(at):
-    """Time (s) and squared closing speed (m2/s2) at which the rear vehicle would reach the front vehicle.
-
-    The controlled vehicle between them is left out. Infinite and 0 if they never meet. ``at``: one world (columns: file
-    ``line``).
-    """
-    rear = braking(at[ONSET_R], at[A_R])
-    return walk(at[GAP_L] + at[GAP_R], at[V_L], braking(0.0, at[A_L]), at[V_R], rear, math.inf)[1:]
 
 
 @large
@@ -205,7 +149,7 @@ def front_first(at, floor, best, enough, cells):
         if last < stand:
             best = soft_harm(FRONT_FIRST, at, stand, stand, floor, best)
     time, squared = outer_contact(at)
-    if time == math.inf or (time > end + _GRAZE_S and not leans):
+    if time == math.inf or (time > end + GRAZE_S and not leans):
         return best
     least = gentlest_front(at, min(time, last))[0] if time > first else 0.0
     front = max(least, 0.5 * math.sqrt(squared))
@@ -220,26 +164,12 @@ def rear_first(at, floor, best, enough, cells):
     ``floor`` (m2/s2) is a known bound on the front pair's harm; the search may stop early once its result is at most
     ``enough`` (m2/s2). Other arguments: package ``proofs``.
     """
-    high = max(at[V_F] / at[A_F], rest_of_rear(at))
-    first = meet_rear(at, high)
-    if first == math.inf or not stays_behind(at, first, first):
+    first, last, end, late = rear_times(at)
+    if first == math.inf:
         return best
-    last, low, top = meet_rear(at, 0.0), 0.0, high
-    avoids = last == math.inf
-    if avoids:
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + top)
-            if meet_rear(at, middle) < math.inf:
-                top = middle
-            else:
-                low = middle
-        last = meet_rear(at, top)
-    end = last_first(REAR_FIRST, at, first, last)
     best = least_contact_harm(REAR_FIRST, at, first, end, floor, best, enough, cells)
-    if not avoids or end < last:
+    if late == last:
         return best
-    # no first contact is possible after both have come to rest, or after the rear vehicle would reach the front one
-    late = max(min(max(high, at[V_L] / at[A_L]), outer_contact(at)[0]), last) + _GRAZE_S
     part = (late - last) / _PARTS
     for k in range(_PARTS):
         best = soft_harm(REAR_FIRST, at, last + k * part, last + (k + 1) * part, floor, best)
@@ -280,12 +210,14 @@ def combined_bound(at, until, front, rear, cells):
 
 
 @large
-def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
+def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, boxes, memory, out):
     """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2): front pair, rear pair, both together.
 
     ``rows`` [n, LINE_COLUMNS]: the worlds (columns: ``proofs/line.py``). Harm after ``until`` [n] (s) does not count.
     ``has_front`` [n]: whether the front vehicle exists and the next impact with it counts; ``has_rear`` [n]: the same
-    for the rear vehicle. ``unavoidable`` [n]: whether contact cannot be avoided. ``cells``: memory, overwritten.
+    for the rear vehicle. ``unavoidable`` [n]: whether contact cannot be avoided. ``boxes`` and ``memory``
+    (``chain_search``): without columns, the bound on both pairs is that of harm; otherwise that of the honest cost.
+    ``cells``, ``boxes``, ``memory``: overwritten.
     """
     for k in range(len(out)):
         for column in range(BOUNDS):
@@ -298,6 +230,8 @@ def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
             out[k, REAR_BOUND] = squared if time < until[k] and squared > TOUCH_HARM else 0.0
         if unavoidable[k]:
             out[k, COMBINED_BOUND] = combined_bound(rows[k], until[k], out[k, FRONT_BOUND], out[k, REAR_BOUND], cells)
+        if unavoidable[k] and boxes.shape[1] > 0 and last_rest(rows[k]) < until[k]:
+            out[k, COMBINED_BOUND] = max(out[k, COMBINED_BOUND], chain_bound(rows[k], until[k], boxes, memory))
 
 
 def lower_bound(
@@ -313,8 +247,9 @@ def lower_bound(
     Args:
         state: the n episodes now.
         body: the controlled vehicle (1: Vehicle 1); all others brake fully.
-        count: ``first`` (of each pair only the first impact), ``total``, or ``honest``, which has the bound of
-            ``total`` because the honest cost is never below total harm.
+        count: ``first`` (of each pair only the first impact), ``total``, or ``honest``. The honest cost is never below
+            total harm; with a time step, ``combined`` also counts the prices of pushing and driving and further
+            impacts (``chain_search``), which takes 0.01 s a world.
         horizon_s: time until which harm counts, s after the alert.
         time_step_s: time between two decisions (s); the first decision is when the vehicle may act. None: commands
             may change at any time. With a time step the bound is larger, but holds only for commands that change at
@@ -327,6 +262,7 @@ def lower_bound(
     reason = avoidability(state, body).reason
     start = state.time_s + rows_of(state, body)[:, ONSET_F]
     _check_asked(state, start, count, horizon_s, time_step_s)
+    columns = BOXES if count == "honest" and time_step_s is not None else 0
     count = "total" if count == "honest" else count
     full = np.pad(-state.braking_capacity_mps2, ((0, 0), (1, 0)))
     now = hold_commands(state._replace(wanted=full), start)  # until then all brake fully
@@ -339,8 +275,10 @@ def lower_bound(
 
     def bound(first: int) -> None:
         part = slice(first, first + _AT_ONCE)
-        cells = np.empty((CELLS, CELL_COLUMNS))
-        bound_worlds(rows[part], until[part], has_front[part], has_rear[part], unavoidable[part], cells, out[part])
+        cells, boxes, memory = np.empty((CELLS, CELL_COLUMNS)), np.empty((BOX_ROWS, columns)), np.empty((2, BOX_ROWS))
+        bound_worlds(
+            rows[part], until[part], has_front[part], has_rear[part], unavoidable[part], cells, boxes, memory, out[part]
+        )
 
     with ThreadPoolExecutor(os.cpu_count() or 1) as threads:
         list(threads.map(bound, range(0, state.n, _AT_ONCE)))

@@ -1,4 +1,4 @@
-"""The measures ``avoidable`` and ``proven_harm``: what the proofs say of each world.
+"""The measures ``avoidable``, ``proven_harm`` and ``proven_cost``: what the proofs say of each world.
 
 They are computed only on request, because a proof is slow.
 """
@@ -28,7 +28,7 @@ def avoidable(game: Game, alert: State, last: State) -> MeasureValue:
     return {"": verdict.avoidable, "reason": verdict.reason_name}
 
 
-_bound_cache: dict[bytes, LowerBound] = {}  # of the worlds that were last asked for: all agents drive the same ones
+_bound_cache: dict[str, tuple[bytes, LowerBound]] = {}  # count -> worlds of the last request, and their bounds
 
 
 def proven_harm(game: Game, alert: State, last: State) -> MeasureValue:
@@ -36,14 +36,26 @@ def proven_harm(game: Game, alert: State, last: State) -> MeasureValue:
 
     ``impact``: whether the bound is above 0. The result is the same for every agent.
     """
+    bound = _bound(game, alert, "first")
+    return {"": bound.harm, "impact": bound.impact_proven}
+
+
+def proven_cost(game: Game, alert: State, last: State) -> MeasureValue:
+    """Lower bound on the honest cost, whatever the controlled vehicle commands at its decisions, [n] m2/s2.
+
+    The result is the same for every agent.
+    """
+    return {"": _bound(game, alert, "honest").harm}
+
+
+def _bound(game: Game, alert: State, count: str) -> LowerBound:
     body, settings = _controlled_body(game, alert), game.settings
     ends = np.array([body, settings.horizon_s, settings.time_step_s])
     request = ends.tobytes() + alert.line.tobytes() + alert.car.tobytes()
-    if request not in _bound_cache:
-        bound = lower_bound(alert, body, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s)
-        _bound_cache.clear()
-        _bound_cache[request] = bound
-    return {"": _bound_cache[request].harm, "impact": _bound_cache[request].impact_proven}
+    if request != _bound_cache.get(count, (b"",))[0]:
+        bound = lower_bound(alert, body, count=count, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s)
+        _bound_cache[count] = request, bound
+    return _bound_cache[count][1]
 
 
 def _controlled_body(game: Game, alert: State, *, together: bool = False) -> int:
@@ -58,11 +70,13 @@ def _controlled_body(game: Game, alert: State, *, together: bool = False) -> int
         or (alert.wanted[:, scripted_bodies] != -capacities(alert.car, BRAKING, alert.time_s)[:, scripted_bodies]).any()
     ):
         raise InvalidInput(
-            "avoidable, proven_harm: a vehicle that does not learn does not brake fully; all others must"
+            "avoidable, proven_harm, proven_cost: a vehicle that does not learn does not brake fully; all others must"
         )
     if len(learners) != 1 and not (together and learners == [2, 3]):
         names = ", ".join(f"vehicle_{body}" for body in learners)
-        raise InvalidInput(f"avoidable, proven_harm: {names} learn; the proofs cover one controlled vehicle")
+        raise InvalidInput(
+            f"avoidable, proven_harm, proven_cost: {names} learn; the proofs cover one controlled vehicle"
+        )
     return int(learners[0])
 
 
@@ -74,3 +88,6 @@ PROVEN_HARM = Part(
         Statistic("impact_proven_rate", "rate", "Impact proven", "Impact\nproven", "impact"),
     ),
 )  # fmt: skip
+PROVEN_COST = Part(
+    proven_cost, unit="m2/s2", statistics=(Statistic("proven_cost", "mean", "Proven cost", "Proven\ncost"),)
+)

@@ -1,0 +1,314 @@
+"""The honest cost that must follow a first contact: the contact with the second neighbour, and the third contact.
+
+A *chain* is a first contact of the controlled vehicle, the pushing of that pair after it, the contact with the second
+neighbour, and the next contact with the first neighbour. A *box* is a set of chains: a column of ``boxes``
+[BOX_ROWS, BOXES], with the smallest and the largest value of five quantities. Each function bounds the cost of all
+chains of a box.
+
+Theorem and proof: docs/internals/proofs/honest-bound.md. Arguments: ``proofs/__init__.py``.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.extensions.proofs.line import (
+    A_F,
+    A_L,
+    A_R,
+    BOUNCE,
+    FRONT_FIRST,
+    FRONT_SHARE,
+    GAP_L,
+    GAP_R,
+    LIMIT_F,
+    ONSET_R,
+    REAR_SHARE,
+    TIME_STEP,
+    U_F,
+    V_F,
+    V_L,
+    follower,
+    leader,
+)
+from ethbrake_marl.extensions.proofs.meetings import rest_of_rear
+from ethbrake_marl.extensions.proofs.plans import braking, drive_then_brake, walk
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.contact import contact
+from ethbrake_marl.motion.impact import PLASTIC_MPS, TOUCH_MPS
+from ethbrake_marl.motion.interval import solo
+
+# rows of a box: bound on the honest cost (m2/s2); time (s) and closing speed (m/s) of the first contact; push of its
+# pair before the second neighbour's contact (m/s); time (s) of this contact, infinite: there is none; its closing speed
+COST, EARLY, LATE, SOFT, HARD, PUSH, MOST_PUSH, SINCE, UNTIL, SOFT_2, HARD_2 = range(11)
+BOX_ROWS = 11
+
+PRICE = 10.0  # of a push, m/s (``episode.counts``)
+TOUCHES = 4.0  # at least the number of touches of a pair in one interval of constant commands
+OUTWARD = 1e-9  # margin of places (m) and speeds (m/s) against rounding
+NEAR_M = 1e-8  # the same margin where a vehicle must be at a place
+DRIVES = 8  # number of parts into which the driving before a third contact is divided
+TIGHTENINGS = 4  # halvings of the range of the second closing speed
+
+
+@kernel
+def price_of(at, push, closing):
+    """Least price (m2/s2) of a ``push`` (m/s) after a first contact with the speed ``closing`` (m/s).
+
+    After a touch, one impact of closing speed w does a part of the push, ``(1 + e) w``, for its harm ``w^2``.
+    """
+    if closing > TOUCH_MPS:
+        return PRICE * push
+    best = 0.5 * PRICE * (1.0 + at[BOUNCE])
+    impact = min(push / (1.0 + at[BOUNCE]), best)
+    return impact * impact + PRICE * (push - (1.0 + at[BOUNCE]) * impact)
+
+
+@kernel
+def bounce_of(at, closing):
+    """Restitution of an impact of at least ``closing`` (m/s). ``at``: one world (columns: ``proofs/line.py``)."""
+    return at[BOUNCE] if closing >= PLASTIC_MPS else 0.0
+
+
+@kernel
+def slowing(share, bounce, soft, hard):
+    """Largest ``(1 - share (1 + e)) w`` (m/s) for closing speeds w from ``soft`` to ``hard``; e is 0 if w is small."""
+    rest = 1.0 - share * (1.0 + bounce)
+    return max(rest * (hard if rest > 0.0 else soft), (1.0 - share) * min(hard, PLASTIC_MPS))
+
+
+@kernel
+def third_cost(at, closing, thrown):
+    """Cost (m2/s2) of a third contact with this ``closing`` speed of which the second one caused ``thrown`` (m/s)."""
+    if closing <= TOUCH_MPS:
+        return 0.0
+    return closing * closing + PRICE * (1.0 + bounce_of(at, closing)) * max(closing - thrown, 0.0)
+
+
+@kernel
+def cruise(start, end, duration, first, second, room):
+    """Largest speed c (m/s) in a motion that slows to c, keeps it, and gains speed, over a way of at most ``room`` (m).
+
+    The motion takes ``duration`` (s). It begins with at least the speed ``start`` and ends with at least ``end`` (m/s);
+    it slows with ``first`` and gains with ``second`` (m/s2). Its way is ``c duration + (start - c)^2 / (2 first) +
+    (end - c)^2 / (2 second)``. -inf: every such motion has a longer way.
+    """
+    end = max(end, start - first * duration)
+    start = max(start, end - second * duration)
+    slow = min(start, end)
+    way = slow * duration
+    if start > slow:
+        way += 0.5 * (start - slow) * (start - slow) / first
+    if end > slow:
+        way += 0.5 * (end - slow) * (end - slow) / second
+    if way <= room:
+        return slow
+    if first == 0.0 or second == 0.0:
+        return -math.inf
+    half = 0.5 * (duration - start / first - end / second)
+    both = 0.5 / first + 0.5 / second
+    squared = half * half - both * (0.5 * start * start / first + 0.5 * end * end / second - room)
+    return (math.sqrt(squared) - half) / both if squared >= 0.0 else -math.inf
+
+
+@kernel
+def drive_to_rear(at, start, end, duration, room):
+    """Least speed (m/s) that the controlled vehicle gains by driving on a way of at most ``room`` (m).
+
+    Other arguments: as for ``cruise``. Infinite: the way is longer. ``at``: one world (columns: ``proofs/line.py``).
+    """
+    slow = cruise(max(start, 0.0), max(end, 0.0), duration, at[A_F], at[U_F], room)
+    return max(end - slow, 0.0) if slow >= 0.0 else math.inf
+
+
+@kernel
+def drive_to_front(at, start, end, duration, room):
+    """Least speed (m/s) that the controlled vehicle gains by driving on a way of at least ``room`` (m).
+
+    It begins with at most the speed ``start`` and ends with at most ``end``: with the signs of all speeds reversed,
+    this is the motion of ``cruise``. Infinite: the way is shorter. Other arguments: as for ``drive_to_rear``.
+    """
+    peak = -cruise(-start, -end, duration, at[U_F], at[A_F], -room)
+    return peak - start if peak > max(start, end) else 0.0
+
+
+@large
+def front_chains(at, box, until_end):
+    """Lower bound (m2/s2) on the honest cost of the chains of a box that begin at the front vehicle.
+
+    Infinite if there are none. Raises the row SOFT_2 of ``box`` where smaller values are impossible. Cost after
+    ``until_end`` (s) does not count. ``at``: package ``proofs``.
+    """
+    early, late, soft, hard = box[EARLY], box[LATE], box[SOFT], box[HARD]
+    since, until = max(box[SINCE], early), box[UNTIL]
+    nu, bounce, a_l, a_f, u = at[FRONT_SHARE], at[BOUNCE], at[A_L], at[A_F], at[U_F]
+    v_l, way = leader(at, early)
+    kick = (1.0 - nu) * (1.0 + bounce) * hard
+    v_late, way_late = leader(at, late)
+    driven = drive_to_front(at, at[V_F], v_late + hard + OUTWARD, late, at[GAP_L] + way_late - NEAR_M)
+    cost = soft * soft + price_of(at, box[PUSH], hard) + PRICE * driven
+    ending = min(until, rest_of_rear(at))
+    push = box[MOST_PUSH] + TOUCHES * TOUCH_MPS * ((ending - early) / at[TIME_STEP] + 2.0)
+    gain = (1.0 - nu) * push
+    if u > 0.0 and v_l + kick + gain >= at[LIMIT_F]:
+        gain = push
+    top = v_l + kick + gain + OUTWARD  # the front vehicle never gets ahead of one with this speed at ``early``
+    place = at[GAP_L] + way + OUTWARD
+    if until == math.inf:
+        rear = braking(max(at[ONSET_R] - early, 0.0), at[A_R])
+        v_r, way_r = follower(at, early)
+        met = walk(max(place + at[GAP_R] - way_r, 0.0), top, braking(0.0, a_l), v_r, rear, math.inf)[1]
+        return cost if met == math.inf else math.inf
+    if until < early:
+        return math.inf
+    # the controlled vehicle is where the rear vehicle is, with a speed that it can have there
+    v_r, way_r = follower(at, until)
+    duration = until - early
+    start = v_l + (1.0 - nu * (1.0 + bounce)) * soft - nu * push - OUTWARD
+    room = way_r - at[GAP_R] - place + NEAR_M
+    room += (late - early) * max((1.0 - nu) * hard - nu * box[PUSH], 0.0)
+    driven = drive_to_rear(at, start, v_r - box[HARD_2], duration, room)
+    if driven == math.inf:
+        return math.inf
+    high = box[HARD_2]
+    if drive_to_rear(at, start, v_r - box[SOFT_2], duration, room) == math.inf:
+        for _ in range(TIGHTENINGS):
+            middle = 0.5 * (box[SOFT_2] + high)
+            if drive_to_rear(at, start, v_r - middle, duration, room) == math.inf:
+                box[SOFT_2] = middle
+            else:
+                high = middle
+    cost += PRICE * driven
+    cost += box[SOFT_2] * box[SOFT_2]
+    # it cannot be ahead of the front vehicle
+    front_speed, front_way, _ = solo(top, -a_l, 0.0, math.inf, since - early)
+    gap = place + front_way - (follower(at, since)[1] - at[GAP_R])
+    gap += (until - since) * max(front_speed - v_r, 0.0)
+    if gap < 0.0:
+        return math.inf
+    # the third contact, if it brakes from now on
+    speed = v_r - slowing(at[REAR_SHARE], bounce, box[SOFT_2], box[HARD_2]) - OUTWARD
+    w = speed - front_speed
+    if a_f < a_l or speed <= 0.0:
+        return cost
+    met = contact(gap, w, a_l - a_f)[0] if w > 0.0 else math.inf
+    if met * a_l > front_speed:
+        left = speed * speed - 2.0 * a_f * (gap + 0.5 * front_speed * front_speed / a_l)
+        met = (speed - math.sqrt(left)) / a_f if left >= 0.0 else math.inf
+    if until + met >= until_end:
+        return cost
+    slow = max(at[V_L], a_l * late) + kick - a_l * (since + met)
+    third = speed - a_f * met - max(slow, 0.0) - gain - OUTWARD
+    if third <= 0.0:
+        return cost
+    thrown = at[REAR_SHARE] * (1.0 + bounce) * box[HARD_2] if hard > TOUCH_MPS else math.inf
+    return cost + third_cost(at, third, thrown)
+
+
+@large
+def reached_by_rear(at, gap, speed, u, rear_speed, onset, duration):
+    """Closing speed (m/s) at which the braking rear vehicle reaches the driving controlled vehicle; 0: never.
+
+    The gap is ``gap`` (m) and the speeds are ``rear_speed`` and ``speed`` (m/s). The controlled vehicle drives with
+    ``u`` (m/s2), the rear vehicle brakes from ``onset`` (s) on. A contact after ``duration`` (s) does not count.
+    ``at``: one world (columns: ``proofs/line.py``).
+    """
+    drive = drive_then_brake(speed, u, at[LIMIT_F], math.inf, at[A_F])
+    rest = onset + rear_speed / at[A_R]
+    _, met, squared = walk(gap, speed, drive, rear_speed, braking(onset, at[A_R]), rest)
+    return math.sqrt(squared) if met < duration else 0.0
+
+
+@large
+def third_at_rear(at, gap, speed, rear_speed, onset, duration, thrown):
+    """Least cost (m2/s2) of a third contact with the rear vehicle and of the driving before it.
+
+    ``thrown``: as for ``third_cost``. Other arguments: as for ``reached_by_rear``.
+    """
+    free = third_cost(at, reached_by_rear(at, gap, speed, at[U_F], rear_speed, onset, duration), thrown)
+    least = held = third_cost(at, reached_by_rear(at, gap, speed, 0.0, rear_speed, onset, duration), thrown)
+    part = (held - free) / (PRICE * DRIVES)
+    for k in range(DRIVES if held > free else 0):  # it drives so many parts, or a part of one more
+        closing = reached_by_rear(at, gap, speed + (k + 1) * part, 0.0, rear_speed, onset, duration)
+        least = min(least, PRICE * k * part + max(third_cost(at, closing, thrown), free))
+    return least
+
+
+@large
+def rear_chains(at, box, until_end):
+    """Lower bound (m2/s2) on the honest cost of the chains of a box that begin at the rear vehicle.
+
+    Arguments: as for ``front_chains``.
+    """
+    early, late, soft, hard = box[EARLY], box[LATE], box[SOFT], box[HARD]
+    since, until = max(box[SINCE], early), box[UNTIL]
+    mu, nu, bounce, a_f = at[REAR_SHARE], at[FRONT_SHARE], at[BOUNCE], at[A_F]
+    v_r, way = follower(at, early)
+    place = way - at[GAP_R] - OUTWARD
+    kick = (1.0 - mu) * (1.0 + bounce) * hard
+    v_late, way_late = follower(at, late)
+    driven = drive_to_rear(at, at[V_F], v_late - hard - OUTWARD, late, way_late - at[GAP_R] + NEAR_M)
+    cost = soft * soft + price_of(at, box[PUSH], hard) + PRICE * driven
+    ending = min(until, rest_of_rear(at))
+    push = box[MOST_PUSH] + TOUCHES * TOUCH_MPS * ((ending - early) / at[TIME_STEP] + 2.0)
+    # the rear vehicle never falls behind one with this speed at ``early``
+    slow, onset = max(v_r - kick - (1.0 - mu) * push - OUTWARD, 0.0), max(at[ONSET_R] - early, 0.0)
+    v_l, way_l = leader(at, early)
+    ahead = at[GAP_L] + way_l - place
+    alone = max(min(v_r, v_r - slowing(mu, bounce, soft, hard)) - OUTWARD, 0.0)
+    if until == math.inf:
+        rear = braking(onset, at[A_R])
+        met = walk(ahead, v_l, braking(0.0, at[A_L]), slow, rear, math.inf)[1]
+        if met == math.inf:
+            met = walk(ahead, v_l, braking(0.0, at[A_L]), alone, braking(0.0, a_f), math.inf)[1]
+        return cost if met == math.inf else math.inf
+    if until < early:
+        return math.inf
+    # the controlled vehicle is where the front vehicle is, with a speed that it can have there
+    v_l, way_l = leader(at, until)
+    duration = until - early
+    start = v_r - (1.0 - mu * (1.0 + bounce)) * soft + mu * push + OUTWARD
+    rest = 1.0 - mu * (1.0 + bounce)
+    if rest < 0.0:
+        start = v_r - rest * hard + mu * push + OUTWARD
+    room = at[GAP_L] + way_l - place - NEAR_M
+    room -= (late - early) * max((1.0 - mu) * hard - mu * box[PUSH], 0.0)
+    driven = drive_to_front(at, start, v_l + box[HARD_2], duration, room)
+    if driven == math.inf:
+        return math.inf
+    high = box[HARD_2]
+    if drive_to_front(at, start, v_l + box[SOFT_2], duration, room) == math.inf:
+        for _ in range(TIGHTENINGS):
+            middle = 0.5 * (box[SOFT_2] + high)
+            if drive_to_front(at, start, v_l + middle, duration, room) == math.inf:
+                box[SOFT_2] = middle
+            else:
+                high = middle
+    cost += PRICE * driven
+    cost += box[SOFT_2] * box[SOFT_2]
+    # it stays ahead of the rear vehicle, and of itself if it braked
+    first_v, first_way = leader(at, since)
+    at_since = at[GAP_L] + first_way
+    slow_end, _, _ = solo(slow, -at[A_R], onset, math.inf, until - early)
+    gap = at_since - place - solo(slow, -at[A_R], onset, math.inf, since - early)[1]
+    gap += (until - since) * max(first_v - slow_end, 0.0)
+    braked_end, _, _ = solo(alone, -a_f, 0.0, math.inf, until - early)
+    ahead = at_since - place - solo(alone, -a_f, 0.0, math.inf, since - early)[1]
+    ahead += (until - since) * max(first_v - braked_end, 0.0)
+    if gap < 0.0 or ahead < 0.0:
+        return math.inf
+    # the third contact
+    speed = first_v + slowing(nu, bounce, box[SOFT_2], box[HARD_2]) + OUTWARD
+    thrown = nu * (1.0 + bounce) * box[HARD_2] if hard > TOUCH_MPS else math.inf
+    return cost + third_at_rear(at, gap, speed, slow_end, max(at[ONSET_R] - until, 0.0), until_end - until, thrown)
+
+
+@large
+def chain_cost(kind, at, box, until_end):
+    """Lower bound (m2/s2) on the honest cost of the chains of a box that begin at the neighbour ``kind``.
+
+    Arguments: as for ``front_chains``.
+    """
+    if kind == FRONT_FIRST:
+        return front_chains(at, box, until_end)
+    return rear_chains(at, box, until_end)
