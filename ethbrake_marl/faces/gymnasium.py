@@ -107,7 +107,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
 
     def step(self, action: Any) -> tuple[Observations, Any, bool, bool, dict[str, Any]]:
         """Advance by one time step with an ``action`` [1]."""
-        state, step = self._advance(checked_actions(action, (1, 1), self.name, self.actions))
+        state, step = self.game.step(self._running(), checked_actions(action, (1, 1), self.name, self.actions))
         reward = self._rewards(step)[0, 0]
         ended = bool(step.terminated[0]), bool(step.truncated[0])
         number = float(reward) if step.vector is None else reward

@@ -144,7 +144,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Observations], dict[str, Any], dict[str, bool], dict[str, bool], Infos]:
         """Advance by one time step. Raises ``InvalidInput`` for a missing or bad action of a learner."""
-        state, step = self._advance(self._columns(actions))
+        state, step = self.game.step(self._running(), self._columns(actions))
         rewards = self._rewards(step)[0]
         answer = (
             self._observations(state),

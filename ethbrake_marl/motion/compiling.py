@@ -42,10 +42,11 @@ _EXTENSION = re.compile(rb"^from ethbrake_marl\.extensions\.(\w+)", re.MULTILINE
 
 
 class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Listener that announces the first compilation of a kernel in this process."""
+    """Listener that announces the first compilation of a stored kernel in this process."""
 
     def on_start(self, happened: event.Event) -> None:
-        announce_compilation()
+        if isinstance(happened.data["dispatcher"]._cache, _Cache):  # not a function of the user's
+            announce_compilation()
 
     def on_end(self, happened: event.Event) -> None:
         pass
