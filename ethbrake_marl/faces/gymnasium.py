@@ -69,7 +69,8 @@ class OneLearner(Face):
 class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
     """One learner in a line whose other vehicles follow scripts (``gymnasium.make("EthBrake-v2")``).
 
-    Arguments, actions, ends, infos and options of ``reset`` are the same as in ``EthBrakeParallelEnv``.
+    Arguments, actions, ends, infos and options of ``reset`` are the same as in ``EthBrakeParallelEnv``. Its card,
+    ``docs/reference/environment.md``, lists all observed numbers, terms of rewards, infos and arguments.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")

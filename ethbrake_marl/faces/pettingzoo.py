@@ -28,6 +28,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     """Emergency braking: N vehicles drive in one lane, Vehicle 1 brakes, and those behind it try to do little harm.
 
     The vehicles are the agents, ``vehicle_1`` (front) to ``vehicle_N``. Learners act; the others follow scripts.
+    ``docs/reference/environment.md`` is the card: it lists all observed numbers, terms of rewards, infos and arguments.
 
     **Action space.** ``Box(-1, 1, (1,), float32)`` for every agent: -1 brakes with full capacity, 0 coasts, +1 drives
     with full capacity, once the vehicle's latency since the alert has elapsed. Every learner needs an action, unless
