@@ -57,7 +57,11 @@ def save_data(name: str, data: bytes) -> None:
     """Store data under a name, which must differ whenever the data may differ. Warns if storing is impossible."""
     try:
         path = _trusted_folder() / f"{name}{SUFFIX}"
-        write_file(path, _digest(path, data) + data)
+        try:
+            write_file(path, _digest(path, data) + data)
+        except PermissionError:  # Windows cannot replace a file that another process reads
+            if _read(path, bytes) is None:
+                raise
     except OSError as error:
         _warn_once(f"{_reason(error)}, so {UNSTORED}")
 

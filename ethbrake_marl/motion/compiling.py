@@ -77,7 +77,7 @@ class _Cache(NullCache):  # type: ignore[misc]
     def _name(self, signature: Any, codegen: Any) -> str:
         """Name of the stored file: a digest of everything that the machine code depends on."""
         function = self._function
-        versions = (numba.__version__, llvmlite.__version__, sys.version_info[:2], sys.abiflags)
+        versions = (numba.__version__, llvmlite.__version__, sys.version_info[:2], getattr(sys, "abiflags", ""))
         place = (function.__module__, function.__qualname__, function.__code__.co_firstlineno)
         values = dumps([cell.cell_contents for cell in function.__closure__ or ()])
         decided_by = repr((self._stamp, *versions, *place, values, signature, codegen.magic_tuple()))

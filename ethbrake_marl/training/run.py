@@ -43,7 +43,8 @@ class RunFolder:
         Raises the errors of ``check_new_run``, and ``InvalidInput`` if a process is training in the earlier run.
         """
         exists = check_new_run(self.path, force=force)
-        with self.held() if exists else nullcontext(), new_folder(self.path, replace=exists) as partial:
+        # The lock ends before the folder is replaced: Windows cannot move a folder with an open file.
+        with new_folder(self.path, replace=exists) as partial, self.held() if exists else nullcontext():
             new = RunFolder(partial)
             write_json(new.config, config)
             new.write_status("running")
