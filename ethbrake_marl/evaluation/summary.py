@@ -24,8 +24,8 @@ IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
 COMPARE = {"difference": statistics.difference, "decrease": statistics.decrease}
 _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
-NARROW, WIDE = 12, 30  # characters of a heading, and of a line about a team, in a terminal
-FEW = 4  # teams whose intervals fit beside each other in a terminal
+WIDE = 30  # characters of a line about a team in a terminal
+FEW = 3  # teams whose intervals fit beside each other in a terminal
 FIRST_COLUMNS = ("collision_rate", *COLUMN.values())  # columns whose intervals stand below the values
 
 HEADINGS = {
@@ -103,8 +103,9 @@ class SummaryTable(list[SummaryRow]):
             (", ".join([first, *(key.removeprefix(name) for key in others)]) + unit, *cells)
             for (name, unit, *cells), [first, *others] in keys.items()
         ]
-        interval: Literal["below", "hidden"] = "below" if len(self) <= FEW else "hidden"
-        columns = [Column(row.agent, short=fill(row.agent, NARROW), interval=interval) for row in self]
+        few = len(self) <= FEW
+        interval: Literal["below", "hidden"] = "below" if few else "hidden"
+        columns = [Column(row.agent, short=fill(row.agent, 16 if few else 10), interval=interval) for row in self]
         return Sheet("Means or rates of further measures", ["Measure", *columns], rows, gap=1) if rows else None
 
     def tables(self) -> list[Sheet]:
