@@ -38,7 +38,7 @@ def watch_command(
     settings: SettingsOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Show or write a real-time film of agents that drive the same world.
+    """Show a real-time film of agents that drive the same world.
 
     The film shows the road to scale, the commands, the impacts and the harm. A PNG file shows three moments: the alert,
     the hardest impact, and the end; the text shows the alert, every impact, and the end.
