@@ -75,6 +75,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(INSTALL) --torch "$(TORCH_INDEX)" || exit; \
 	echo "== Installing the packages for training and tests, at the versions of constraints.txt"; \
 	$(INSTALL) -e ".[train,dev]" || exit; \
+	! kill -0 $$compiling 2>/dev/null || echo "== Waiting for the physics to be compiled: a minute or more, only once"; \
 	wait $$compiling || \
 	  echo "== Some of the physics could not be compiled (see above); commands compile it when they need it" >&2
 	@echo "== torch $$($(BIN)/python -c 'from importlib.metadata import version; print(version("torch"))')"

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import traceback
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
 from numbers import Integral
+from sysconfig import get_paths
 
 from ethbrake_marl.renamed import new_name
 
@@ -18,6 +20,12 @@ _NAMED = 5  # largest number of failed worlds that a message lists one by one
 LINE_LIMIT = 1_500  # characters of a message; a longer message is shortened in the middle
 
 _KEPT_BEGINNING, _KEPT_END = 1_000, 400
+
+_LIBRARIES = tuple(get_paths()[key] for key in ("stdlib", "platstdlib", "purelib", "platlib"))
+
+_MOST_SUGGESTED = 3  # names that an error message suggests
+
+NAMES: dict[str, Callable[[], Iterable[str]]] = {}  # kind such as ``agent`` -> function that lists all its names
 
 
 def plain_text(text: str, keep: str = "") -> str:
@@ -48,21 +56,25 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
     """Short text about an exception from a user's code: class, message, and the line that raised it.
 
     ``path``: the user's file; the line is then the last one in the traceback that belongs to this file. None: the
-    innermost line, or no line if this package raised the error. The class of this package's own errors is not named.
+    innermost line of code that is neither Python's own, nor an installed package's, nor this package's; without such
+    code the innermost line of another package, or no line. The class of this package's own errors is not named.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
     if isinstance(error, SyntaxError):
         where = "" if error.lineno is None else f"line {error.lineno}: "
         return f"{where}{type(error).__name__}: {error.msg}"
+    if isinstance(error, FileNotFoundError) and not os.path.isabs(error.filename or os.sep):
+        text += f"; a relative path begins in the current folder, {os.getcwd()}"
     if path is not None:
         lines = [frame.lineno for frame in frames if frame.filename == path]
         return f"line {lines[-1]}: {text}" if lines else text
-    if isinstance(error, EthBrakeError) or not frames:
+    outside = [frame for frame in frames if not frame.filename.startswith((os.path.dirname(__file__), "<frozen"))]
+    if isinstance(error, EthBrakeError) or not outside:  # the call itself failed: wrong parameters
         return text
-    if frames[-1].filename.startswith(os.path.dirname(__file__)):  # the call itself failed: wrong parameters
-        return text
-    return f"{text} ({os.path.basename(frames[-1].filename)}, line {frames[-1].lineno})"
+    of_user = [frame for frame in outside if not frame.filename.startswith(_LIBRARIES)]
+    place = (of_user or outside)[-1]
+    return f"{text} ({os.path.basename(place.filename)}, line {place.lineno})"
 
 
 class EthBrakeError(Exception):
@@ -191,11 +203,15 @@ class AgentFailed(InvalidInput):
 
 
 class Unfamiliar(UserWarning):
-    """A trained policy, or a table of best known harm, was made for other worlds or for other physics."""
+    """A trained policy, or a table of best known harm, was made for other worlds or physics, or for unknown ones."""
 
 
 class CacheFault(UserWarning):
     """The cache of compiled physics code is damaged, or cannot be written, so code is compiled again."""
+
+
+class IgnoredName(UserWarning):
+    """The key ``name`` in a scenario's file differs from the name of the file, which counts."""
 
 
 class FreeImpacts(UserWarning):
@@ -203,15 +219,21 @@ class FreeImpacts(UserWarning):
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Error for an unknown name. Its message suggests a similar name, or the new name in 2.0, or lists ``known``.
+    """Error for an unknown name. Its message says the new name in 2.0, or what else has this name, or suggests similar
+    names, or lists ``known``.
 
     ``kind``: noun such as ``scenario``. ``may_be_own``: a message that lists names also says that a user's own part
     must be registered first.
     """
-    names = sorted({*known})
-    close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
+    names, text = sorted({*known}), name if isinstance(name, str) else ""
+    longer = [known_name for known_name in names if known_name.startswith(text)]
+    close = longer if len(longer) <= _MOST_SUGGESTED and longer else get_close_matches(text, names, n=1)
     advice = f"; your own {kind} must be registered or installed first (docs/extend.md)" if may_be_own else ""
-    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{advice}"
+    hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"known: {', '.join(names) or 'none'}{advice}"
+    first = re.split("[,:+@]", text)[0]
+    others = sorted(other for other in NAMES.keys() - {kind} if kind in NAMES and first in NAMES[other]())
+    if others:
+        hint = f"{first!r} names another kind: {', '.join(others)}; were two values swapped?"
     return UnknownName(f"unknown {kind} {name!r}; {new_name(kind, name) or hint}")
 
 

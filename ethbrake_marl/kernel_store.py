@@ -9,8 +9,11 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import sys
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -21,7 +24,6 @@ from ethbrake_marl.files.store import write_file
 SUFFIX = ".compiled"
 UNSTORED = "every process compiles the physics again; set NUMBA_CACHE_DIR to a folder that can be written"
 _DIGEST_BYTES = 32
-_tellers: list[Callable[[bool], None]] = []
 _warned: list[str] = []
 
 
@@ -55,7 +57,11 @@ def save_data(name: str, data: bytes) -> None:
     """Store data under a name, which must differ whenever the data may differ. Warns if storing is impossible."""
     try:
         path = _trusted_folder() / f"{name}{SUFFIX}"
-        write_file(path, _digest(path, data) + data)
+        try:
+            write_file(path, _digest(path, data) + data)
+        except PermissionError:  # Windows cannot replace a file that another process reads
+            if _read(path, bytes) is None:
+                raise
     except OSError as error:
         _warn_once(f"{_reason(error)}, so {UNSTORED}")
 
@@ -76,17 +82,13 @@ def delete_damaged() -> tuple[int, int]:
     return len(damaged), sum(not _delete(path) for path in damaged)
 
 
-def on_first_compilation(tell: Callable[[bool], None]) -> None:
-    """Register a function: this process calls ``tell(is_empty)`` once, just before it first compiles.
-
-    ``is_empty``: the cache contains no compiled code yet.
-    """
-    _tellers.append(tell)
-
-
+@cache
 def announce_compilation() -> None:
-    while _tellers:
-        _tellers.pop()(not _stored_files())
+    """Print a line on stderr, once in this process, just before it first compiles."""
+    what = "parts of the physics" if _stored_files() else "the physics for the first time, which takes a minute or more"
+    advice = "" if obstacle() else "; later processes use the stored result (in advance: ethbrake doctor --compile)"
+    with suppress(AttributeError, OSError, ValueError):  # there is no stderr
+        print(f"compiling {what}{advice}", file=sys.stderr, flush=True)  # noqa: T201
 
 
 def _stored_files() -> list[Path]:

@@ -12,6 +12,7 @@ from typing import Literal
 
 from ethbrake_marl.errors import one_line
 
+LEAST_SHARE = 0.03  # of the work, after which the time left is estimated
 EVERY_S = 10.0  # time between two lines of progress (s) if stderr is not a terminal
 
 
@@ -43,6 +44,12 @@ class Progress:
         words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm", "honest_cost": "honest cost"}
         parts = [f"{words[key]} {value:.2f}" for key, value in self.metrics.items() if key in words]
         return ", ".join(parts[:1])
+
+    @property
+    def measured(self) -> str:
+        """The harm, with the step at which it was measured if this is an earlier one."""
+        step = self.metrics.get("steps", self.done)
+        return f"{self.harm} at step {step:,.0f}" if self.harm and step != self.done else self.harm
 
     @staticmethod
     def listener(on_progress: ProgressOption) -> OnProgress | None:
@@ -81,8 +88,8 @@ class ShownProgress:
             self._print(f"{one_line(progress.note)}\n")
         begun_s, first = self._begun.setdefault(progress.name, (now, progress.done))
         text = f"{progress.name}: {progress.done:,} of {progress.total:,}"
-        text += f", {progress.harm}" if progress.harm else ""
-        if progress.done > first:
+        text += f", {progress.measured}" if progress.harm else ""
+        if progress.done > first + LEAST_SHARE * progress.total:
             left_s = (now - begun_s) * (progress.total - progress.done) / (progress.done - first)
             text += f", about {left_s:.0f} s left" if left_s >= 1.0 else ""
         if self._terminal:

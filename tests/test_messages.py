@@ -1,10 +1,14 @@
 """Texts of errors and what a terminal is shown."""
 
 import pickle
+import re
+from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.text import Text
 
+import ethbrake_marl as eb
 from ethbrake_marl.cli.command import Out, print_note
 from ethbrake_marl.errors import (
     LINE_LIMIT,
@@ -67,3 +71,58 @@ def test_whole_number__is_in_its_range_and_no_truth_value(value: object) -> None
     with pytest.raises(InvalidInput, match=r"worlds = .*: must be a whole number in 1\.\.8"):
         check_whole_number("worlds", value, 1, 8)
     check_whole_number("worlds", 8, 1, 8)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: eb.evaluate("full_brake,ppo", "paper-random"),
+            "'full_brake' names another kind: agent; were two values swapped?",
+        ),
+        (lambda: eb.evaluate("universal+step", "paper-random"), "'universal' names another kind: agent, recipe"),
+        (lambda: eb.evaluate("paper-random", "paper-distance"), "'paper-distance' names another kind: scenario"),
+        (lambda: eb.train("paper-distance", "ppo", "run"), "'paper-distance' names another kind: scenario"),
+        (lambda: eb.make_agent("step"), "'step' names another kind: shield or search"),
+        (lambda: eb.evaluate(measures="pushed", episodes=1), "did you mean 'pushed_m' or 'pushed_mps'?"),
+        (lambda: eb.load_scenario("level-0-sensor"), "did you mean 'level-0-sensors'?"),
+        (lambda: eb.parallel_env(reward={"comfort": 1.0}), "must be registered or installed first"),
+    ],
+)
+def test_unknown_name__of_something_else_or_with_two_neighbours(call: Any, message: str) -> None:
+    with pytest.raises(UnknownName, match=re.escape(message)):
+        call()
+
+
+USERS_FILE = """\
+import json
+from pathlib import Path
+
+def missing():
+    return Path("model.json").read_text()
+
+def damaged():
+    return json.loads("{")
+
+class Odd:
+    name, knows = "odd", "own sensors"
+    def begin(self, alert, body):
+        return None
+    def act(self, state, memory, body):
+        return json.loads("["), memory
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("missing", "a relative path begins in the current folder, {folder} (mine.py, line 5)"),
+        ("damaged", "(mine.py, line 8)"),
+        ("Odd", "(mine.py, line 15)"),
+    ],
+)
+def test_error_of_a_users_code__names_the_users_line(name: str, message: str, empty_folder: Path) -> None:
+    Path("mine.py").write_text(USERS_FILE)
+    with pytest.raises(InvalidInput) as raised:
+        eb.evaluate("paper-random", f"mine.py:{name}", episodes=1)
+    assert str(raised.value).endswith(message.format(folder=empty_folder))

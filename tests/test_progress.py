@@ -35,3 +35,20 @@ def test_progress__is_updated_in_place_on_a_terminal(monkeypatch, capsys) -> Non
         "[##########] worlds: 4,000 of 4,000\x1b[K\none is\\nleft out\n",
         "[          ] figures: 0 of 2\x1b[K\n",
     ]
+
+
+@pytest.mark.parametrize("done, left", [(1, ""), (30, ""), (31, ", about 625 s left")])
+def test_time_left__is_estimated_from_a_few_per_cent_of_the_work(done: int, left: str, monkeypatch, capsys) -> None:
+    seconds = iter([0.0, 20.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(seconds))
+    show = ShownProgress()
+    show(Progress("training", 0, 1_000))
+    capsys.readouterr()
+    show(Progress("training", done, 1_000))
+    assert capsys.readouterr().err == f"training: {done} of 1,000{left}\n"
+
+
+def test_harm__stands_beside_the_step_of_its_measurement(capsys) -> None:
+    for steps, text in ((300, "honest cost 4.50"), (0, "honest cost 4.50 at step 0")):
+        ShownProgress()(Progress("training", 300, 1_000, {"steps": steps, "honest_cost": 4.5}))
+        assert capsys.readouterr().err == f"training: 300 of 1,000, {text}\n"

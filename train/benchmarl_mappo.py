@@ -1,4 +1,4 @@
-"""BenchMARL's MAPPO on a level of cooperation. Needs the extra `marl` (`.venv/bin/pip install '.[marl]'`).
+"""BenchMARL's MAPPO on a level of cooperation. Needs the extra `marl` (`.venv/bin/pip install -e '.[marl]'`).
 
     python train/benchmarl_mappo.py --scenario cooperation-3-pair --steps 200000 --output runs/mappo
     ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@runs/mappo --set rules=honest

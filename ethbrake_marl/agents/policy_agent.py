@@ -242,7 +242,7 @@ def policy_agent(
         name: name in tables; None: name of the function, class or file.
         scenario: scenario in which the policy was trained.
         observation: features on which the policy was trained; None: the features named by its observation space or ONNX
-            metadata, or else those of ``scenario``, or else ``[own, front_1, rear_1]``.
+            metadata, or else those of ``scenario``, or else, with a warning, ``[own, front_1, rear_1]``.
         initial_state: number of episodes n -> first memory: an array with n rows, or a tuple of such arrays.
         clip: clip actions to [-1, 1], or indices to the valid ones; otherwise they are errors.
         actions: number of discrete actions, evenly spaced from -1 to 1, if the policy returns indices.
@@ -282,6 +282,14 @@ def policy_agent(
             " its training"
         )
     is_assumed = observation is None and trained_on is None and trained_in is None
+    if is_assumed:
+        warnings.warn(
+            f"{who}: nothing says which features the policy observes, so it gets the usual {len(view.names)},"
+            f" {view.names[0]} to {view.names[-1]}; pass scenario= for the scenario of its training, or"
+            " observation=[...]",
+            Unfamiliar,
+            stacklevel=2,
+        )
     time_step_s = math.nan if trained_in is None else trained_in.time_step_s
     known = range_of(policy, ask, len(view.names), who)
     return PolicyAgent(policy, name, ask, view, is_assumed, time_step_s, initial_state, clip, actions, known)

@@ -87,7 +87,11 @@ class Team(NamedTuple):
         driven, learners = sorted(self.drivers), sorted(game.settings.learners.tolist())
         if driven != learners:
             names, right = (", ".join(f"vehicle_{i}" for i in bodies) or "nobody" for bodies in (driven, learners))
-            raise InvalidInput(f"team {self.name!r}: drives {names}; must drive exactly {right}")
+            raise InvalidInput(
+                f"team {self.name!r}: drives {names}; must drive exactly {right}; to change this, change which vehicles"
+                " learn: learners=[...] of an environment, scenario.with_learners([...]), or on the command line --set"
+                " roles.vehicle_3=learner"
+            )
         if self.shield is not None and not learners:
             raise InvalidInput(
                 f"team {self.name!r}: the scenario has no learner that its shield could guard; leave out the shield, or"

@@ -24,7 +24,6 @@ from ethbrake_marl import __version__
 from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
 from ethbrake_marl.cli.command import INTERRUPTED, Out, example
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, describe_error, naming_extras
-from ethbrake_marl.kernel_store import obstacle, on_first_compilation
 from ethbrake_marl.registry import DISTRIBUTION, Registry, giver, points
 from ethbrake_marl.renamed import new_name
 
@@ -152,7 +151,6 @@ def prepare_streams() -> None:
 
     Characters that stdout's encoding lacks, such as m², are printed as ``?``. Text that libraries and child processes
     write to stdout without Python's ``sys.stdout`` goes to stderr. Each warning of this package is printed on one line.
-    A message announces the first compilation of numba kernels.
     """
     for name, mode in (("stdin", "r"), ("stdout", "r"), ("stderr", "w")):  # a closed stdout refuses results
         if getattr(sys, name) is None:  # closed by the caller: keep its number from the next file that is opened
@@ -172,13 +170,6 @@ def prepare_streams() -> None:
             default_hook(message, category, *place, **more)
 
     warnings.showwarning = show_warning
-    on_first_compilation(print_compilation)
-
-
-def print_compilation(is_empty: bool) -> None:
-    """Print that numba kernels are being compiled. ``is_empty``: whether no kernels are stored yet."""
-    part = "the physics for the first time, which takes a while" if is_empty else "parts of the physics"
-    Out().note(f"compiling {part}{'' if obstacle() else '; later commands use the stored result'}")
 
 
 def abandon_output() -> None:

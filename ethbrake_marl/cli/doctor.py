@@ -21,7 +21,7 @@ from ethbrake_marl import __version__
 from ethbrake_marl.cli.command import JsonOption, Out
 from ethbrake_marl.kernel_store import UNSTORED, cache_folder, delete_damaged, obstacle
 
-EXTRAS = ("train", "marl", "export", "data", "render", "cluster")
+EXTRAS = ("train", "report", "marl", "export", "data", "render", "cluster", "tune", "cuda")
 
 _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=tried=16", "--set=evaluation.worlds=10")
 
@@ -62,7 +62,7 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
     return [
         Check("ethbrake_marl", True, f"{__version__} in {_PACKAGE}"),
         Check("python", True, f"{platform.python_version()} at {sys.executable}"),
-        *_dependencies(),
+        *dict.fromkeys(_dependencies()),  # torch once: two extras install it
         _check("processor", _processor),
         _check("kernel cache", _kernel_cache),
         *([_check("compile", lambda: compile_ahead(training=has_torch))] if compile_all else []),

@@ -52,12 +52,11 @@ def experiment_command(
     so far; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_TRAINING) as out:
-        # torch takes seconds to load, here and in the other commands that learn
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.episode.counts import IN_WORDS
         from ethbrake_marl.names import require_learner
-        from ethbrake_marl.training.experiment import HYBRID, POLICY, SHIELDED, run_experiment
         from ethbrake_marl.training.recipe import load_recipe
+        from ethbrake_marl.training.training import check_new_run
 
         plan = load_recipe(recipe or quickest())
         changes = read_settings(settings, [*type(plan).model_fields])
@@ -67,10 +66,19 @@ def experiment_command(
             plan = load_recipe(quickest(several=True))
             changes = read_settings(settings, [*type(plan).model_fields])
         plan = change_recipe(plan, changes.recipe, out)
+        folder = output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed)
+        check_new_run(folder.expanduser(), force=force)
+        from ethbrake_marl.training.experiment import (  # torch takes seconds to load
+            HYBRID,
+            POLICY,
+            SHIELDED,
+            run_experiment,
+        )
+
         experiment, tables, where = run_experiment(
             plan,
             chosen,
-            output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed),
+            folder,
             steps=steps,
             seed=seed,
             episodes=episodes,

@@ -76,11 +76,9 @@ def train_command(
     bit for bit, as without the interruption.
     """
     with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_TRAINING) as out:
-        # torch takes seconds to load
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.training.recipe import load_recipe
-        from ethbrake_marl.training.train import resume as go_on, train
-        from ethbrake_marl.training.training import Training
+        from ethbrake_marl.training.training import Training, check_new_run
 
         if resume is not None:
             options = {
@@ -92,6 +90,8 @@ def train_command(
                     f"{option}: cannot be combined with --resume, which uses the settings in the run's folder; leave"
                     " one of the two options out"
                 )
+            from ethbrake_marl.training.train import resume as go_on
+
             show_trained(out, go_on(resume, on_progress=out.show_progress, other_versions=other_versions))
             return
         if other_versions:
@@ -101,13 +101,15 @@ def train_command(
         chosen = changes.change_scenario(scenario or "paper-random")
         plan = change_recipe(plan, changes.recipe, out)
         begun = [Training.of(plan, chosen).who_drives()]
+        folder = output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed)
+        check_new_run(folder.expanduser(), force=force)
+        from ethbrake_marl.training.train import train  # torch takes seconds to load
 
         def tell(progress: Progress) -> None:
             if begun:  # at the first progress report all input has been checked
                 out.note(begun.pop())
             out.show_progress(progress)
 
-        folder = output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed)
         result = train(
             plan, chosen, folder, steps=steps, seed=seed, device=device, force=force, on_progress=tell,
             settings=changes.texts,

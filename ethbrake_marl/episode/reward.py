@@ -176,7 +176,7 @@ def reward_params(reward: Reward) -> RewardParams:
     known = [*RewardParams.model_fields, *registered_terms()]
     for name in reward:
         if name not in known:
-            raise unknown_name("setting of a reward", name, known)
+            raise unknown_name("term or setting of a reward", name, known, may_be_own=True)
     try:
         return RewardParams(**reward)
     except ValidationError as error:

@@ -42,6 +42,7 @@ class Result:
     worlds: Columns  # column -> [n]: number, recording, quantities that differ, ``hidden`` (`hidden_from`)
     measures: tuple[Measure, ...]
     knows: Mapping[str, str]  # team -> what the team must know
+    drivers: Mapping[str, Mapping[str, str]]  # team -> vehicle -> name of its agent
     policies: Mapping[str, Mapping[str, str]]  # team -> vehicle -> SHA-256 of its policy
     about: Mapping[str, Any]  # plain data: scenario, seed, times, digests, versions
 
@@ -170,6 +171,7 @@ def evaluate_teams(
         {**columns, "hidden": hidden_from(alert, game)},
         chosen,
         {name: known_by(team) for name, team in agents.items()},
+        {name: {f"vehicle_{i}": agent.name for i, agent in team.drivers.items()} for name, team in agents.items()},
         {name: policy_digests(team.drivers) for name, team in agents.items()},
         {
             "scenario": game.name,

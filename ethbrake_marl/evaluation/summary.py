@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any
+from textwrap import fill
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
 COMPARE = {"difference": statistics.difference, "decrease": statistics.decrease}
 _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
+WIDE = 30  # characters of a line about a team in a terminal
+FEW = 3  # teams whose intervals fit beside each other in a terminal
 FIRST_COLUMNS = ("collision_rate", *COLUMN.values())  # columns whose intervals stand below the values
 
 HEADINGS = {
@@ -69,10 +72,7 @@ class SummaryTable(list[SummaryRow]):
             for key, (_, statistic) in self.statistics.items()
             if statistic.heading
         ]
-        rows = [
-            (row.marked, f"{SEES_THROUGH} " * row.sees_through + row.knows, *(row.estimates[c.name] for c in columns))
-            for row in self
-        ]
+        rows = [(row.marked, row.about, *(row.estimates[c.name] for c in columns)) for row in self]
         return Sheet("", ["Agent", "Knows", *columns], rows)
 
     def terminal(self) -> Sheet:
@@ -83,19 +83,30 @@ class SummaryTable(list[SummaryRow]):
             for column in sheet.columns[2:]
             if isinstance(column, Column)
         ]
-        rows = [(f"{name}\n{knows}", *cells) for name, knows, *cells in map(list, sheet.rows)]
+        rows = []
+        for name, about, *cells in map(list, sheet.rows):
+            rows.append(("\n".join([name, *(fill(part, WIDE) for part in about.split("; "))]), *cells))
         first = [column for column in columns if column.name in FIRST_COLUMNS]
         return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
 
     def measures(self) -> Sheet | None:
-        """Table of additional measures without a column in the main table; None if there are none."""
-        labels = {
-            key: f"{key} ({measure.unit})" if measure.unit and statistic.kind != "decrease" else key
-            for key, (measure, statistic) in self.statistics.items()
-            if not statistic.heading and measure not in DEFAULT
-        }
-        rows = [(row.agent, words, row.estimates[key]) for row in self for key, words in labels.items()]
-        return Sheet("Measures", ["Agent", "Measure", Column("Mean or rate")], rows, gap=1) if rows else None
+        """Table of the measures without a column in the main table, a column for each team; None if there are none.
+
+        Vehicles whose values are equal under every team share a row.
+        """
+        keys: dict[tuple[Any, ...], list[str]] = {}  # measure, unit and a cell for each team -> keys of estimates
+        for key, (measure, statistic) in self.statistics.items():
+            if not statistic.heading and measure not in DEFAULT:
+                unit = f" ({measure.unit})" if measure.unit and statistic.kind != "decrease" else ""
+                keys.setdefault((measure.name, unit, *(row.estimates[key] for row in self)), []).append(key)
+        rows = [
+            (", ".join([first, *(key.removeprefix(name) for key in others)]) + unit, *cells)
+            for (name, unit, *cells), [first, *others] in keys.items()
+        ]
+        few = len(self) <= FEW
+        interval: Literal["below", "hidden"] = "below" if few else "hidden"
+        columns = [Column(row.agent, short=fill(row.agent, 16 if few else 10), interval=interval) for row in self]
+        return Sheet("Means or rates of further measures", ["Measure", *columns], rows, gap=1) if rows else None
 
     def tables(self) -> list[Sheet]:
         return [self.terminal(), *filter(None, [self.measures()])]
@@ -194,6 +205,7 @@ def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
             horizon_ends=int((team_columns["ended"] == HORIZON).sum()),
             episodes=result.n,
             hidden_share=float(result.worlds["hidden"].mean()),
+            drivers=result.drivers[team],
             policies=result.policies[team],
         )
         for team, team_columns in columns.items()

@@ -34,6 +34,7 @@ class SummaryRow:
     horizon_ends: int  # number of worlds in which a vehicle still moves at the horizon
     episodes: int  # number of worlds
     hidden_share: float  # share of worlds in which the V2X channel hides something from a controlled vehicle
+    drivers: Mapping[str, str]  # vehicle -> name of its agent
     policies: Mapping[str, str]  # vehicle -> SHA-256 of its policy
 
     def __getitem__(self, key: str) -> Estimate | None:
@@ -75,12 +76,20 @@ class SummaryRow:
         """Name of the team, with ‡ if the team has ``exploits``."""
         return f"{self.agent} {EXPLOITS}" if self.exploits else self.agent
 
+    @property
+    def about(self) -> str:
+        """What the team knows, with † if it is omniscient; and who drives which vehicle if its agents differ."""
+        mixed = len({*self.drivers.values()}) > 1
+        drivers = [f"{vehicle}: {agent}" for vehicle, agent in self.drivers.items() if mixed]
+        return "; ".join([f"{SEES_THROUGH} " * self.sees_through + self.knows, *drivers])
+
     def to_json(self) -> dict[str, Any]:
         """Row as plain data: each estimate with interval, standard error and degrees of freedom; None if unknown."""
         plain: dict[str, Any] = {
             "agent": self.agent, "knows": self.knows, "sees_through_channel": self.sees_through,
             "hidden_share": self.hidden_share, "episodes": self.episodes, "collisions": self.collisions,
             "horizon_ends": self.horizon_ends, "exploits": list(self.exploits),
+            "drivers": dict(self.drivers),
         }  # fmt: skip
         for key, estimate in self.estimates.items():
             plain |= Estimate.side_by_side({key: estimate})

@@ -44,15 +44,12 @@ class Face:
             raise InvalidInput(f"{what}: no episode is running; call reset first")
         return self.episode
 
-    def _advance(self, actions: Floats) -> tuple[State, Step]:
-        """State after one step, and the ``Step``, for ``actions`` [n, L].
-
-        The running episode changes only in ``_keep``.
-        """
-        before = self._begun("step")
-        if not self.begins_again and before.clock[0, ENDED] == 1.0:
+    def _running(self) -> State:
+        """The running episode, which changes only in ``_keep``. Raises ``InvalidInput`` if none is running."""
+        running = self._begun("step")
+        if not self.begins_again and running.clock[0, ENDED] == 1.0:
             raise InvalidInput("step: no episode is running; call reset first")
-        return self.game.step(before, actions)
+        return running
 
     def _keep(self, stream: Stream, state: State, show: Callable[[State], None]) -> None:
         """Show the state by ``show``, a method of the renderer; replace the running episode and its sequence of worlds.

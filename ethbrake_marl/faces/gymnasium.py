@@ -69,7 +69,8 @@ class OneLearner(Face):
 class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
     """One learner in a line whose other vehicles follow scripts (``gymnasium.make("EthBrake-v2")``).
 
-    Arguments, actions, ends, infos and options of ``reset`` are the same as in ``EthBrakeParallelEnv``.
+    Arguments, actions, ends, infos and options of ``reset`` are the same as in ``EthBrakeParallelEnv``. Its card,
+    ``docs/reference/environment.md``, lists all observed numbers, terms of rewards, infos and arguments.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")
@@ -107,7 +108,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
 
     def step(self, action: Any) -> tuple[Observations, Any, bool, bool, dict[str, Any]]:
         """Advance by one time step with an ``action`` [1]."""
-        state, step = self._advance(checked_actions(action, (1, 1), self.name, self.actions))
+        state, step = self.game.step(self._running(), checked_actions(action, (1, 1), self.name, self.actions))
         reward = self._rewards(step)[0, 0]
         ended = bool(step.terminated[0]), bool(step.truncated[0])
         number = float(reward) if step.vector is None else reward

@@ -32,6 +32,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     """Emergency braking: N vehicles drive in one lane, Vehicle 1 brakes, and those behind it try to do little harm.
 
     The vehicles are the agents, ``vehicle_1`` (front) to ``vehicle_N``. Learners act; the others follow scripts.
+    ``docs/reference/environment.md`` is the card: it lists all observed numbers, terms of rewards, infos and arguments.
 
     **Action space.** ``Box(-1, 1, (1,), float32)`` for every agent: -1 brakes with full capacity, 0 coasts, +1 drives
     with full capacity, once the vehicle's latency since the alert has elapsed. Every learner needs an action, unless
@@ -154,7 +155,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Observations], dict[str, Any], dict[str, bool], dict[str, bool], Infos]:
         """Advance by one time step. Raises ``InvalidInput`` for a missing or bad action of a learner."""
-        state, step = self._advance(self._columns(actions))
+        state, step = self.game.step(self._running(), self._columns(actions))
         rewards = step.reward[0].tolist() if step.vector is None else step.vector[0]
         answer = (
             self._observations(state),

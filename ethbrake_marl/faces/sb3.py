@@ -154,8 +154,9 @@ class EthBrakeVecEnv(Face, VecEnv):
 
     def step_wait(self) -> tuple[Observations, Any, Bools, list[dict[str, Any]]]:
         """Advance every world by one time step; where an episode ends, the next one begins in the same rows."""
+        before = self._running()
         actions = checked_actions(self._given, (self.num_envs, 1), "the learners", self.actions)
-        state, step = self._advance(actions.reshape(self.n, -1))
+        state, step = self.game.step(before, actions.reshape(self.n, -1))
         stream, observations, over = self.stream, self._observe(state), state.ended
         ended = np.flatnonzero(over)
         reward = self._rewards(step).reshape(-1)

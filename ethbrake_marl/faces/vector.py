@@ -89,10 +89,11 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
 
     def step(self, actions: Any) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with ``actions`` [n, 1]."""
-        same, rows = self.autoreset_mode is AutoresetMode.SAME_STEP, np.flatnonzero(self._begun("step").ended)
+        same, before = self.autoreset_mode is AutoresetMode.SAME_STEP, self._running()
         numbers = checked_actions(actions, (self.num_envs, 1), "the learners", self.actions)
+        rows = np.flatnonzero(before.ended)
         numbers[rows] = 0.0  # the action of a row that begins again is ignored
-        state, step = self._advance(numbers)
+        state, step = self.game.step(before, numbers)
         stream, observations, columns = self.stream, self._observe(state), self._columns(self.stream, state, step)
         infos = with_masks(columns)
         if same:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -238,13 +239,16 @@ class Sheet:
 
 
 def terminal_text(*parts: RenderableType) -> str:
-    """Tables and texts as plain text, as wide as the terminal."""
+    """Tables and texts as plain text, as wide as the terminal, in characters that stdout can print."""
     from rich.console import Console
 
-    text = io.StringIO()
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"  # such as cp1252 or ASCII
+    content = io.BytesIO()
+    text = io.TextIOWrapper(content, encoding, errors="replace", newline="\n")
     console = Console(file=text, highlight=False, color_system=None, force_jupyter=False, force_terminal=False)
     console.print(*parts)
-    return text.getvalue()
+    text.flush()
+    return content.getvalue().decode(encoding)
 
 
 def flat_row(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -30,7 +30,7 @@ def new_file(path: Path) -> Iterator[Path]:
     partial = _temporary(path.parent)
     try:
         yield partial
-        with partial.open("rb") as file:
+        with partial.open("rb+") as file:  # Windows cannot flush a file that is open for reading only
             os.fsync(file.fileno())
         os.replace(partial, path)
     except BaseException:

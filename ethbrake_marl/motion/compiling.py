@@ -43,10 +43,11 @@ _EXTENSION = re.compile(rb"^from ethbrake_marl\.extensions\.(\w+)", re.MULTILINE
 
 
 class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Listener that announces the first compilation of a kernel in this process."""
+    """Listener that announces the first compilation of a stored kernel in this process."""
 
     def on_start(self, happened: event.Event) -> None:
-        announce_compilation()
+        if isinstance(happened.data["dispatcher"]._cache, _Cache):  # not a function of the user's
+            announce_compilation()
 
     def on_end(self, happened: event.Event) -> None:
         pass
@@ -77,7 +78,7 @@ class _Cache(NullCache):  # type: ignore[misc]
     def _name(self, signature: Any, codegen: Any) -> str:
         """Name of the stored file: a digest of everything that the machine code depends on."""
         function = self._function
-        versions = (numba.__version__, llvmlite.__version__, sys.version_info[:2], sys.abiflags)
+        versions = (numba.__version__, llvmlite.__version__, sys.version_info[:2], getattr(sys, "abiflags", ""))
         place = (function.__module__, function.__qualname__, function.__code__.co_firstlineno)
         values = dumps([cell.cell_contents for cell in function.__closure__ or ()])
         decided_by = repr((self._stamp, *versions, *place, values, signature, codegen.magic_tuple()))

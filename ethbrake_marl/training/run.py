@@ -13,10 +13,10 @@ from typing import Any, Literal, get_args
 from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, TensorBoardOutputFormat
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.store import hold_lock, new_folder, remove_unfinished, write_file
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.training.training import STATUS_FILE, Training, check_new_run
 from ethbrake_marl.worlds.scenario import Scenario
 
 Status = Literal["running", "finished", "interrupted", "failed"]
@@ -30,7 +30,7 @@ class RunFolder:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).expanduser()
         self.config = self.path / "config.json"  # recipe and scenario in full, seeds, versions
-        self.status = self.path / "run.json"  # steps, status and reason, evaluations
+        self.status = self.path / STATUS_FILE  # steps, status and reason, evaluations
         self.policy = self.path / "policy"  # the best policies, or the last ones if nothing was measured
         self.last_policy = self.path / "policy-last"
         self.progress = self.path / "progress.csv"  # a row per update
@@ -40,18 +40,11 @@ class RunFolder:
     def create(self, config: Mapping[str, Any], *, force: bool = False) -> None:
         """Create the folder with ``config.json`` and ``run.json``. With ``force`` it replaces an earlier run.
 
-        Raises ``AlreadyExists`` if anything else is at this path, and ``InvalidInput`` if a process is training in the
-        earlier run.
+        Raises the errors of ``check_new_run``, and ``InvalidInput`` if a process is training in the earlier run.
         """
-        exists = os.path.lexists(self.path)
-        if exists and (self.path.is_symlink() or not self.status.is_file()):
-            raise AlreadyExists(f"{self.path}: already exists and is not the folder of a run; choose another name")
-        if exists and not force:
-            raise AlreadyExists(
-                f"{self.path}: this run already exists; choose another folder (--output), resume the run (ethbrake"
-                " train --resume), or replace it (--force; make run ARGS=--force)"
-            )
-        with self.held() if exists else nullcontext(), new_folder(self.path, replace=exists) as partial:
+        exists = check_new_run(self.path, force=force)
+        # The lock ends before the folder is replaced: Windows cannot move a folder with an open file.
+        with new_folder(self.path, replace=exists) as partial, self.held() if exists else nullcontext():
             new = RunFolder(partial)
             write_json(new.config, config)
             new.write_status("running")

@@ -18,7 +18,7 @@ from stable_baselines3.common.logger import Logger
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
 from ethbrake_marl.files.plain import read_object
-from ethbrake_marl.names import check_path, open_game
+from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.progress import Progress, ProgressOption
@@ -28,7 +28,7 @@ from ethbrake_marl.training import checkpoint
 from ethbrake_marl.training.fixed_list import Policies, PolicyMeasure, measure_on_list
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, algorithm_of
 from ethbrake_marl.training.run import RunFolder
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.training.training import Training, check_new_run
 from ethbrake_marl.training.updates import BetweenUpdates, Stopped, check_finite_model
 from ethbrake_marl.worlds.game import AnyScenario
 
@@ -124,7 +124,7 @@ def train(
     changes = {"scheme": scheme, "seed": seed, "total_steps": steps, "device": device}
     training = Training.of(recipe, scenario, **{key: value for key, value in changes.items() if value is not None})
     folder = RunFolder(directory)
-    check_path(directory)
+    check_new_run(folder.path, force=force)
     with _one_training() as stop, closing(make_environment(training)) as environment:
         evaluate = None if measure is None else measure(training)
         model = make_model(training, environment)

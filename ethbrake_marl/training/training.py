@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from ethbrake_marl.episode.objectives import OBJECTIVES, objectives_of
 from ethbrake_marl.episode.observe import View
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.names import check_path
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
@@ -17,6 +20,8 @@ from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario, views_of
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
 from ethbrake_marl.worlds.scenario import Scenario
+
+STATUS_FILE = "run.json"  # in the folder of a run
 
 
 class Training(NamedTuple):
@@ -133,3 +138,20 @@ def _check(recipe: TrainingRecipe, scenario: Scenario, scheme: Scheme, learners:
             f"scheme {scheme}: the algorithm {recipe.algorithm} of recipe {recipe.name!r} does not support this scheme;"
             " use a recipe for PPO, for instance cooperation-ppo"
         )
+
+
+def check_new_run(folder: Path, *, force: bool = False) -> bool:
+    """Check that a run can be written to ``folder``. Returns whether it replaces an earlier run, as ``force`` allows.
+
+    Raises ``AlreadyExists`` if anything else is at this path, and ``InvalidInput`` for a comma or plus in the path.
+    """
+    check_path(folder)
+    exists = os.path.lexists(folder)
+    if exists and (folder.is_symlink() or not (folder / STATUS_FILE).is_file()):
+        raise AlreadyExists(f"{folder}: already exists and is not the folder of a run; choose another name")
+    if exists and not force:
+        raise AlreadyExists(
+            f"{folder}: this run already exists; choose another folder (--output), resume the run (ethbrake train"
+            " --resume), or replace it (--force; make run ARGS=--force)"
+        )
+    return exists

@@ -90,8 +90,11 @@ class BetweenUpdates(BaseCallback):
         stopping = self.stop()
         if due or stopping:
             self.write_checkpoint()
-        if stopping:
+        if stopping:  # the checkpoint does not contain this measurement, so a resumed training has the same bits
             self.keep_weights()
+            if self.evaluate is not None and self.evaluations[-1]["steps"] != self.steps:
+                self.make_policies()
+                self.measure()
             raise Stopped
 
     def _on_rollout_end(self) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
+from ethbrake_marl.errors import NAMES, AlreadyExists, IgnoredName, InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS, changed_content
 from ethbrake_marl.worlds.scenario import Scenario, plain
@@ -67,8 +69,9 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
 def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenario:
     """Load a scenario from its name, from the path of its file, or from the content of such a file.
 
-    Raises ``UnknownName`` for an unknown name. Raises ``InvalidInput`` for a bad file (with file, line, key and value),
-    and for a file whose key ``name`` differs from the file's own name.
+    Raises ``UnknownName`` for an unknown name. Raises ``InvalidInput`` for a bad file (with file, line, key and value).
+    If the key ``name`` differs from the file's name, warns (``IgnoredName``): the file's name counts, with ``-`` for
+    characters that no name has.
     """
     if isinstance(scenario, Scenario):
         return scenario
@@ -81,11 +84,14 @@ def _load(path: Path, above: tuple[Path, ...]) -> Scenario:
     """Load the scenario file ``path``. ``above``: chain of files that need it; each of them needs the next one."""
     document = read_yaml(path)
     loaded = _build_scenario(document, path.parent, (*above, path))
-    if loaded.name != path.stem:
-        raise InvalidInput(
-            f"{document.where(('name',))}: name = {loaded.name}: must be the file's name without ending, {path.stem};"
-            f" change the name, or rename the file to {loaded.name}{path.suffix}"
+    name = re.sub("[^a-z0-9_-]", "-", path.stem.lower()).lstrip("-_")[:64] or loaded.name
+    if name != loaded.name:
+        warnings.warn(
+            f"{document.where(('name',))}: name = {loaded.name} is ignored: the file's name counts, so this is {name}",
+            IgnoredName,
+            stacklevel=4,
         )
+        loaded = loaded.replace(name=name)
     return loaded
 
 
@@ -129,6 +135,9 @@ def list_scenarios() -> list[CatalogueEntry]:
 def _known_paths() -> dict[str, Path]:
     registered = (path for folder in FOLDERS.values() for path in folder.glob("*.yaml"))
     return {path.stem: path for path in (*registered, *shipped_folder().rglob("*.yaml"))}
+
+
+NAMES["scenario"] = _known_paths
 
 
 def _build_scenario(document: Document, folder: Path, above: tuple[Path, ...]) -> Scenario:

@@ -538,3 +538,11 @@ def test_failure__names_the_agent_and_has_no_circle(function: Any) -> None:
         error = error.__cause__ or error.__context__  # type: ignore[assignment]
     assert len(seen) <= 2
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+
+
+def test_function_without_a_scenario__is_warned_of_what_it_observes() -> None:
+    with pytest.warns(Unfamiliar, match="so it gets the usual .*, own.speed to .*; pass scenario="):
+        policy_agent(brake)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        policy_agent(brake, scenario="paper-random"), policy_agent(brake, observation=["own"])

@@ -174,7 +174,6 @@ def test_agents_from_a_file__drive_on_the_command_line_behind_a_shield(ethbrake,
 def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatch) -> None:
     for owner, name in ((sys, "stdout"), (frame.warnings, "showwarning")):
         monkeypatch.setattr(owner, name, getattr(owner, name))
-    monkeypatch.setattr(frame, "on_first_compilation", Mock())
     before = os.dup(1)
     sys.stdout = sys.__stdout__
     try:
@@ -188,18 +187,19 @@ def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatc
     assert capfd.readouterr() == ("result\n", "raw")
 
 
-@pytest.mark.parametrize("name, said", [("", "the physics for the first time, which takes a while"), ("a", "parts of")])
-def test_compilation__is_announced(name: str, said: str, tmp_path, monkeypatch, capsys) -> None:
-    """What is said promises no time, and no stored result where none can be stored."""
+@pytest.mark.parametrize(
+    "name, what", [("", "the physics for the first time, which takes a minute or more"), ("a", "parts")]
+)
+def test_compilation__is_announced_once(name: str, what: str, tmp_path, monkeypatch, capsys) -> None:
+    """The line promises no stored result where none can be stored."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(kernel_store, "_tellers", [frame.print_compilation])
+    announce = kernel_store.announce_compilation.__wrapped__
     if name:
         kernel_store.save_data(name, b"")
-    kernel_store.announce_compilation()
-    kernel_store.announce_compilation()
+    announce()
     [line] = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"compiling {said}") and line.endswith("; later commands use the stored result")
+    assert line.startswith(f"compiling {what}") and "; later processes use the stored result (in advance: " in line
     (tmp_path / "file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
-    frame.print_compilation(is_empty=True)
-    assert capsys.readouterr().err == "compiling the physics for the first time, which takes a while\n"
+    announce()
+    assert capsys.readouterr().err == "compiling the physics for the first time, which takes a minute or more\n"

@@ -1,5 +1,6 @@
 """``ethbrake doctor``: what it finds wrong, what it compiles."""
 
+import re
 import sys
 from pathlib import Path
 from unittest.mock import Mock
@@ -63,6 +64,14 @@ def test_dependencies__too_old_and_missing_ones_are_told(monkeypatch) -> None:
     assert found("no-such-package") == (False, "is not installed; needs >=1")
     assert found("no-such-extra") == (True, "is not installed; the extra train installs it")
     assert found("scipy")[0]
+
+
+def test_extras__are_those_of_the_page() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "installing.md").read_text()
+    listed = re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)
+    assert sorted(doctor.EXTRAS) == sorted(name for name in listed if name not in ("all", "docs"))
+    names = [check.name for check in dict.fromkeys(doctor._dependencies())]
+    assert {"matplotlib", "optuna", "numba-cuda"} <= {*names} and names.count("numpy") == 1
 
 
 def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings(monkeypatch) -> None:

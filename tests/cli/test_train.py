@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,17 @@ def test_train__ends_with_harm_beside_full_braking_and_a_command_that_measures_t
     for told, row in zip(figures["fixed_list"]["results"], rows, strict=True):
         assert told == {name: pytest.approx(row[name]) if name != "agent" else row[name] for name in told}
         assert f"{row['first_impact_harm']:.2f}" in answer.out and f"{row['total_harm']:.2f}" in answer.out
+
+
+@pytest.mark.parametrize("command", ["train", "run"])
+def test_folder_that_exists__is_refused_before_torch_is_loaded(command: str, empty_folder: Path) -> None:
+    Path("mine").mkdir()
+    program = (
+        "import sys; from ethbrake_marl.cli.app import run_command\n"
+        f"print(run_command(['{command}', '--output', 'mine']), 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "2 False\n" and "mine: already exists and is not the folder of a run" in done.stderr
 
 
 def test_train__under_honest_rules_says_so_in_the_recipe_the_table_and_the_command(

@@ -234,6 +234,8 @@ def test_step__before_the_first_reset_is_refused(name: str) -> None:
     interface = make(name)
     with pytest.raises(InvalidInput, match="step: no episode is running; call reset first"):
         interface.step(np.zeros((interface.n, 1), np.float32))
+    with pytest.raises(InvalidInput, match="step: no episode is running; call reset first"):
+        interface.step(np.full((interface.n, 1), np.nan, np.float32))  # whatever the action
 
 
 @each_bare

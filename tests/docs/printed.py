@@ -45,7 +45,11 @@ TABLES: dict[str, tuple[str, ...]] = {
 }
 
 PICTURES: dict[str, tuple[str, ...]] = {
-    "emergency.png": ("ethbrake watch --agents full_brake,universal --output emergency.png",),
+    "emergency.gif": ("ethbrake watch --agents full_brake,universal --output emergency.gif",),
+    **{
+        f"gallery/{film.name}": (f"python docs/studies/gallery.py . --only {film.stem}",)
+        for film in sorted((DOCS / "figures" / "gallery").glob("*.gif"))
+    },
     "deceleration.png": (
         'python -c "import ethbrake_marl as eb;'
         " from ethbrake_marl.extensions.report import deceleration_figure, write_picture;"

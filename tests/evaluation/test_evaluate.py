@@ -271,7 +271,7 @@ def test_measures_of_two_files_with_one_name__stand_side_by_side_and_one_after_t
     assert [row.estimates[key].value for key in keys] == [1.0, 2.0, 0.0, 1.0]  # type: ignore[union-attr]
     assert table.sheet().names[5:7] == ["mine.py:near_rate", "b/mine.py:near_rate"]
     assert {"Near (mine.py)", "Near (b/mine.py)"} < table.meanings().keys()
-    assert [cells[1] for cells in table.measures().rows] == ["mine.py:worst (1)", "b/mine.py:worst (1)"]  # type: ignore[union-attr]
+    assert [cells[0] for cells in table.measures().rows] == ["mine.py:worst (1)", "b/mine.py:worst (1)"]  # type: ignore[union-attr]
 
 
 def test_measures__with_one_statistic_are_refused() -> None:

@@ -164,6 +164,31 @@ def test_measures_without_a_heading__have_a_table_of_their_own(monkeypatch: pyte
     assert summarise(evaluated("paper-random", 20)).measures() is None
 
 
+def test_vehicles_that_are_equal_under_every_agent__share_a_row() -> None:
+    result = evaluated("cooperation-2-five", 2, [FULL_BRAKE, COAST], ["jerk"])
+    values = {"full_brake": [1.0, 1.0, 3.0, 1.0, 5.0], "coast": [1.0, 9.0, 3.0, 1.0, 5.0]}
+    columns = {
+        team: {**result[team], **{f"jerk_{i}": np.full(2, value) for i, value in enumerate(numbers, 1)}}
+        for team, numbers in values.items()
+    }
+    sheet = summarise(replace(result, columns=columns)).measures()
+    assert sheet is not None and sheet.headings == ["Measure", "full_brake", "coast"]
+    assert [[str(row[0]), *(cell.value for cell in row[1:])] for row in sheet.rows] == [
+        ["jerk_1, _4 (m2/s6)", 1.0, 1.0],
+        ["jerk_2 (m2/s6)", 1.0, 9.0],
+        ["jerk_3 (m2/s6)", 3.0, 3.0],
+        ["jerk_5 (m2/s6)", 5.0, 5.0],
+    ]
+
+
+def test_mixed_team__says_who_drives_which_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
+    teams = {"mixed": {"vehicle_2": "coast", "vehicle_3": "constant:4"}, "alike": "coast"}
+    table = summarise(eb.evaluate("cooperation-3-pair", teams, episodes=2))
+    lines = [line.split("  ")[0].rstrip() for line in at(80, table, monkeypatch).splitlines()]
+    assert lines[3:7] == ["mixed", "own sensors", "vehicle_2: coast", "vehicle_3: constant:4"]
+    assert "vehicle_2: coast" not in lines[7:] and table[0].to_json()["drivers"]["vehicle_3"] == "constant:4"
+
+
 # ---- below the table
 
 
@@ -173,7 +198,9 @@ def pushing(pushed_m: float, moving: int) -> SummaryTable:
     ends = np.where(np.arange(20) < moving, "horizon", "at_rest")
     mine = {**result["full_brake"], "pushed_m_1": np.linspace(0.0, 2.0 * pushed_m, 20), "ended": ends}
     columns = {"full_brake": result["full_brake"], "mine": mine}
-    both: dict[str, Any] = {"knows": dict.fromkeys(columns, ""), "policies": {key: {} for key in columns}}
+    both: dict[str, Any] = {"knows": dict.fromkeys(columns, "")} | {
+        field: {key: {} for key in columns} for field in ("drivers", "policies")
+    }
     return summarise(replace(result, columns=columns, **both))
 
 

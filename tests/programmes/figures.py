@@ -13,7 +13,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from tests.docs.printed import ROOT, Shown, missing_figures, pictures, tables
 from tests.programmes import Cases, Given, Told
@@ -38,17 +38,26 @@ def told_by(command: str) -> str:
         return run(command, Path(folder))
 
 
+def frames(path: Path) -> list[np.ndarray]:
+    """Frames of a film, or the only one of a picture, each [height, width, 4] uint8."""
+    with Image.open(path) as image:
+        return [np.asarray(frame.convert("RGBA")) for frame in ImageSequence.Iterator(image)]
+
+
+def unequal_share(old: list[np.ndarray], new: list[np.ndarray]) -> float:
+    """Share of the pixels that differ visibly; fainter differences are the drawing library's."""
+    pairs = zip(old, new, strict=True)
+    return float(np.mean([(np.abs(a.astype(int) - b).max(axis=2) > 8).mean() for a, b in pairs]))
+
+
 def differing_picture(picture: Shown, folder: Path) -> list[str]:
     """Difference between the pixels of an old and a new picture, in words; empty if there is none."""
     for command in picture.commands:
         run(command, folder)
-    old, new = (
-        np.asarray(Image.open(path / picture.begin).convert("RGBA"), int)
-        for path in (ROOT / "docs" / "figures", folder)
-    )
-    if old.shape != new.shape:
-        return [f"{new.shape[1]} x {new.shape[0]} pixels, not {old.shape[1]} x {old.shape[0]}"]
-    share = float((np.abs(old - new).max(axis=2) > 8).mean())  # fainter differences are the drawing library's
+    old, new = map(frames, (ROOT / "docs" / "figures" / picture.begin, folder / Path(picture.begin).name))
+    if (len(old), old[0].shape) != (len(new), new[0].shape):
+        return [f"{len(new)} frames of {new[0].shape} pixels, not {len(old)} of {old[0].shape}"]
+    share = unequal_share(old, new)
     return [f"{share:.2%} of the pixels"] if share > 1e-4 else []
 
 

@@ -88,6 +88,7 @@ def test_resume__after_ctrl_c_everything_is_the_same(name: str, whole: Made, tmp
     stopped = begin(name, run, on_progress=ctrl_c)
     assert (stopped.status, stopped.updates) == ("interrupted", seen[-1])
     assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
+    assert stopped.evaluations[-1]["steps"] == stopped.steps > 0  # the last policy is measured
     go_on(run)
     assert kept(run) == whole(name)
 

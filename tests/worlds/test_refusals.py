@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.errors import UnknownName
+from ethbrake_marl.errors import IgnoredName, UnknownName
 from ethbrake_marl.files.yaml import parse_yaml
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.explain import new_scenario_text
@@ -368,7 +368,12 @@ def test_unknown_scenario__is_told_what_is_near() -> None:
         load_scenario("zzz")
 
 
-def test_file__has_the_name_of_its_scenario(empty_folder: Path) -> None:
-    Path("other.yaml").write_text(new_scenario_text("mine"))
-    with refused("other.yaml, line 13: name = mine: must be the file's name without ending, other; change the name"):
-        load_scenario("other.yaml")
+@pytest.mark.parametrize(
+    ("file", "name"), [("other.yaml", "other"), ("Wet Five.yml", "wet-five"), ("_a.b,c+d.yaml", "a-b-c-d")]
+)
+def test_file__gives_its_scenario_the_name(file: str, name: str, empty_folder: Path) -> None:
+    Path(file).write_text(new_scenario_text("mine"))
+    with pytest.warns(IgnoredName, match=f"line 13: name = mine is ignored: the file's name counts, so this is {name}"):
+        assert load_scenario(file).name == name
+    Path(file).write_text(new_scenario_text(name))
+    assert load_scenario(file).name == name

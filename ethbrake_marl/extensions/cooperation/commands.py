@@ -168,7 +168,13 @@ def front_command(
 
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.episode.counts import check_count
-        from ethbrake_marl.extensions.cooperation.front import corners, least_largest, search_front, weight_grid
+        from ethbrake_marl.extensions.cooperation.front import (
+            FRONT_CHUNK,
+            corners,
+            least_largest,
+            search_front,
+            weight_grid,
+        )
         from ethbrake_marl.extensions.cooperation.front_results import (
             front_figure,
             front_results,
@@ -180,6 +186,8 @@ def front_command(
         from ethbrake_marl.files.store import check_folder
         from ethbrake_marl.files.yaml import parse_yaml
         from ethbrake_marl.names import split_specs
+        from ethbrake_marl.stopping import stop_on_signal
+        from ethbrake_marl.worlds.sampling import merge_draws
 
         changes = read_settings(settings, of_command=("harm_count",))
         chosen, count = changes.change_scenario(scenario), changes.command.get("harm_count", "honest")
@@ -194,10 +202,23 @@ def front_command(
         drawn_worlds = chosen.draw(episodes, seed)
         names = DEFAULT_AGENTS if agents is None and len(chosen.learners) == 1 else agents or ""
         compared_agents = [spec for spec in split_specs(names) if spec != "full_brake"] if names else []
-        front = search_front(
-            chosen, drawn_worlds.worlds, rows, count=count, budget=budget, threads=jobs or 1, agents=compared_agents,
-            on_progress=lambda searches, total: out.progress("front", searches, total),
-        )  # fmt: skip
+
+        def tell(searches: int, total: int) -> None:
+            if searches == 0:  # all input has been checked
+                out.note(
+                    f"front: {total:,} searches with {budget * len(rows) * episodes:,} candidates or more (--episodes"
+                    f" 100 --steps 1: {budget * (2 * chosen.vehicles + 1) * 100:,}); Ctrl-C keeps the finished worlds,"
+                    f" which are searched {FRONT_CHUNK} at a time"
+                )
+            out.progress("front", searches, total)
+
+        with stop_on_signal() as stop:
+            front = search_front(
+                chosen, drawn_worlds.worlds, rows, count=count, budget=budget, threads=jobs or 1,
+                agents=compared_agents, on_progress=tell, stop=stop,
+            )  # fmt: skip
+        n = front.amounts.shape[1]
+        drawn_worlds = merge_draws([drawn_worlds], np.arange(n))
         largest = least_largest(chosen, drawn_worlds.worlds, front, budget=budget, threads=jobs or 1)
         beside = {"full_brake": full_braking(chosen, drawn_worlds), "maximin": largest}
         results = front_results(front, chosen, drawn_worlds, beside, seed)
@@ -206,6 +227,8 @@ def front_command(
         out.write(output / "front.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
         out.write(output / "front.png", picture_bytes(front_figure(results), "front.png"), "figure")
         out.result(results, front_sheet(results), hypervolume_sheet(results), in_file=True)
+        if n < episodes:
+            out.interrupted(f"interrupted; the results are those of the first {n:,} worlds")
 
 
 FRONT_PART = Part(

@@ -29,7 +29,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 FRONT_BUDGET = 3_000  # candidates per world and choice of weights
 FRONT_CONSTANTS = 101  # constant commands that every search tries
-FRONT_CHUNK = 1_000  # worlds that are searched together
+FRONT_CHUNK = 125  # worlds that are searched together; after each, a search may stop
 MOST_CHOICES = 1_000  # choices of weights in a grid
 SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides between equal choices
 FIRST_SHARE = 0.6  # of the budget; the second round starts from the best results of all choices of weights
@@ -125,6 +125,7 @@ def search_front(
     threads: int = 1,
     agents: Sequence[str] = (),
     on_progress: OnSearch | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Front:
     """Search every world for the commands with the least weighted harm, for every choice of weights.
 
@@ -151,6 +152,7 @@ def search_front(
             ``harm_weight`` and the objective ``preference``.
         on_progress: called with the number of finished searches and of all searches: two for each world and choice,
             and, with several learners, two more for each learner.
+        stop: called after every 125 worlds; if it returns True, the front has only the worlds searched so far.
 
     Raises ``InvalidInput`` if the weights are no table of numbers with a column for each vehicle, or cannot be a
     ``harm_weight``.
@@ -175,12 +177,15 @@ def search_front(
         if on_progress is not None:
             on_progress(done, searches)
 
+    tell(0)
     effort, parts = {"budget": budget, "threads": threads}, []
     for first in range(0, worlds.n, FRONT_CHUNK):
         pool, driven = _search_chunk(
             together, worlds.take(slice(first, first + FRONT_CHUNK)), weights, count, effort, tell
         )
         parts.append((pool.least(weights), driven))
+        if stop():
+            break
     borne = _join_chunks([least for least, _ in parts])
     return Front(weights, count, borne, {name: _join_chunks([driven[name] for _, driven in parts]) for name in agents})
 

@@ -16,13 +16,21 @@ from ethbrake_marl.cli.command import (
     SettingsOption,
     example,
 )
+from ethbrake_marl.errors import InvalidInput, MissingExtra
 from ethbrake_marl.registry import Part
+
+DEFAULT_FILE = "watch.gif"
 
 
 def watch_command(
     output: Annotated[
-        Path, typer.Option(metavar="FILE.gif|FILE.mp4|FILE.png", help="File for the film; .png: three moments of it.")
-    ],
+        Path | None,
+        typer.Option(
+            metavar="FILE.gif|FILE.mp4|FILE.png|-",
+            help="File for the film; .png: three moments of it; -: print it as text.",
+            show_default=f"a window, or {DEFAULT_FILE} if none can be opened",
+        ),
+    ] = None,
     agents: AgentsOption = "e_v2x_bm",
     scenario: ScenarioOption = "paper-random",
     world: Annotated[int, typer.Option(help="Number of the world in the evaluation list.", min=0)] = 0,
@@ -30,26 +38,38 @@ def watch_command(
     settings: SettingsOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Write a real-time film of agents that drive the same world.
+    """Show a real-time film of agents that drive the same world.
 
     The film shows the road to scale, the commands, the impacts and the harm. A PNG file shows three moments: the alert,
-    the hardest impact, and the end.
+    the hardest impact, and the end; the text shows the alert, every impact, and the end.
     """
     from ethbrake_marl.cli.settings import read_settings
-    from ethbrake_marl.extensions.rendering.film import check_film, film
+    from ethbrake_marl.extensions.rendering.film import WRITERS, check_film, films_in_words, films_of, show_in_window
     from ethbrake_marl.names import open_game, require_learner, teams_of
 
     with Out(force=force) as out:
-        out.check(output)
-        check_film(output.suffix.lower())
-        what = "pictures" if output.suffix.lower() == ".png" else "film"
+        in_words = output == Path("-")
+        if output is not None and not in_words:
+            check_film(output.suffix.lower())
+            out.check(output)
         chosen = read_settings(settings, of_command=("harm_count",))
         loaded, game = open_game(chosen.change_scenario(scenario))
         require_learner(loaded)
         teams = teams_of(agents, loaded, harm_count=chosen.command.get("harm_count", "first"))
         titled = {f"{name}: world {world} of {loaded.name}": team for name, team in teams.items()}
-        alert = loaded.sample(1, seed, first=world)
-        out.write(output, film(alert, titled, output.suffix.lower(), game), what=what)
+        films = films_of(loaded.sample(1, seed, first=world), titled, game)
+        if in_words:
+            out.show(films_in_words(films), end="")
+            return
+        if output is None:
+            try:
+                show_in_window(films)
+                return
+            except (InvalidInput, MissingExtra) as error:
+                out.note(f"no window: {error}")
+        path = output or Path(DEFAULT_FILE)
+        what = "pictures" if path.suffix.lower() == ".png" else "film"
+        out.write(path, WRITERS[path.suffix.lower()](films), what=what)
 
 
 WATCH = Part(watch_command, epilog=example("watch --agents full_brake,e_v2x_bm --world 3 --output both.gif"))

@@ -1,4 +1,4 @@
-"""Films of episodes in real time as GIF or MP4, and strips of three moments as PNG."""
+"""Films of episodes in real time, as GIF, MP4 or in a window; and single moments of them, as PNG or text."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.extensions.rendering.picture import HEIGHT, WIDTH, Frame, picture
 from ethbrake_marl.extensions.rendering.scene import Motion, Scene
+from ethbrake_marl.extensions.rendering.viewer import Screen
 from ethbrake_marl.motion.layout import TOTAL
 
+LAST_S = 2  # time for which the last scene stays (s)
 FPS = 25  # scenes per second; a divisor of 100, because a GIF stores times in hundredths of a second
 GIF_COLOURS = 64
 ROAD = 160  # height (pixels) of title, gaps and road, the upper part of a picture
@@ -43,8 +45,11 @@ def film(world: State, teams: Mapping[str, Team], ending: str, game: Game) -> by
     installed.
     """
     check_film(ending)
-    films = {title: film_scenes(world, team, game) for title, team in teams.items()}
-    return WRITERS[ending](films)
+    return WRITERS[ending](films_of(world, teams, game))
+
+
+def films_of(world: State, teams: Mapping[str, Team], game: Game) -> Films:
+    return {title: film_scenes(world, team, game) for title, team in teams.items()}
 
 
 def check_film(ending: str) -> None:
@@ -74,8 +79,33 @@ def write_gif(films: Films) -> bytes:
         Image.fromarray(frame).quantize(GIF_COLOURS, method=Image.Quantize.FASTOCTREE) for frame in stack_films(films)
     )
     buffer = io.BytesIO()
-    first_frame.save(buffer, "GIF", save_all=True, append_images=later_frames, duration=1000 // FPS, loop=0)
+    times_ms = [*len(later_frames) * [1000 // FPS], 1000 * LAST_S]
+    first_frame.save(buffer, "GIF", save_all=True, append_images=later_frames, duration=times_ms, loop=0)
     return buffer.getvalue()
+
+
+def show_in_window(films: Films) -> None:
+    """Play films in a window, one below the other, until their end or until the user closes the window.
+
+    Raises ``MissingExtra`` without pygame-ce, and ``InvalidInput`` if no window can be opened.
+    """
+    frames = [*stack_films(films)]
+    screen = Screen(frames[0])
+    for frame in frames + FPS * LAST_S * frames[-1:]:
+        if not screen.show(frame, FPS):
+            break
+    screen.close()
+
+
+def films_in_words(films: Films) -> str:
+    """Text of films: the first scene, the first scene after every impact, and the end."""
+    texts = []
+    for title, scenes in films.items():
+        before = [(), *(scene.impacts for scene in scenes)]
+        for scene, earlier in zip(scenes, before, strict=False):
+            if scene in (scenes[0], scenes[-1]) or {*scene.impacts} - {*earlier}:
+                texts.append(scene._replace(title=title).text())
+    return "\n".join(texts)
 
 
 def write_mp4(films: Films) -> bytes:

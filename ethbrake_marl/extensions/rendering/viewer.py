@@ -118,39 +118,57 @@ class Window(Viewer):
 
     def _play(self) -> None:
         """Show the last time step in the window, in real time. Open the window first; stop if the user closes it."""
-        pygame = import_pygame()
-        clock = pygame.time.Clock()
         for frame in [] if self.closed else self.step_frames():
-            size = frame.shape[1::-1]
             if self.window is None:
-                self.window = _open(pygame, size)
-            self.window.get_surface().blit(pygame.image.frombuffer(frame.tobytes(), size, "RGB"), (0, 0))
-            self.window.flip()
-            clock.tick(SMOOTH_FPS)
-            for event in pygame.event.get(pygame.WINDOWCLOSE):
-                if event.window is self.window:
-                    self.closed = True
-                else:  # another environment's
-                    pygame.event.post(event)
-            pygame.event.pump()
-            if self.closed:
+                self.window = Screen(frame)
+            if not self.window.show(frame, SMOOTH_FPS):
+                self.closed = True
                 self.close()
                 return
 
     def close(self) -> None:
         if self.window is not None:
-            self.window.destroy()
+            self.window.close()
             self.window = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "window": None}
 
 
-def _open(pygame: Any, size: tuple[int, int]) -> Any:
-    try:
-        pygame.display.init()
-        return pygame.Window("EthBrake", size)
-    except pygame.error as error:
-        raise InvalidInput(
-            f"render_mode = 'human': cannot open a window ({error}); use 'rgb_array', which needs no display"
-        ) from None
+class Screen:
+    """A window of the size of a picture, [H, W, 3].
+
+    Raises ``MissingExtra`` and ``InvalidInput`` as ``import_pygame`` does, and ``InvalidInput`` without a display.
+    """
+
+    def __init__(self, frame: Any) -> None:
+        self.pygame = import_pygame()
+        self.clock = self.pygame.time.Clock()
+        try:
+            self.pygame.display.init()
+            if self.pygame.display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
+                raise self.pygame.error("there is no display")  # SDL's last resort draws where nobody sees it
+            self.window = self.pygame.Window("EthBrake", frame.shape[1::-1])
+        except self.pygame.error as error:
+            raise InvalidInput(
+                f"render_mode = 'human': cannot open a window ({error}); use 'rgb_array', which needs no display"
+            ) from None
+
+    def show(self, frame: Any, fps: int) -> bool:
+        """Show a picture for the time of one frame. Return whether the user has left the window open."""
+        pygame = self.pygame
+        picture = pygame.image.frombuffer(frame.tobytes(), frame.shape[1::-1], "RGB")
+        self.window.get_surface().blit(picture, (0, 0))
+        self.window.flip()
+        self.clock.tick(fps)
+        is_open = True
+        for event in pygame.event.get(pygame.WINDOWCLOSE):
+            if event.window is self.window:
+                is_open = False
+            else:  # another environment's
+                pygame.event.post(event)
+        pygame.event.pump()
+        return is_open
+
+    def close(self) -> None:
+        self.window.destroy()

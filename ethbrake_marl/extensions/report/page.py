@@ -34,6 +34,7 @@ _AFTER_SIGN = re.compile(r"(?<=[:+@,/])(?=.)")
 class Section(NamedTuple):
     title: str  # heading, and entry in the table of contents
     body: Sequence[str]  # HTML (``Markup``), and texts, which become paragraphs
+    folded: bool = False  # whether the reader must open it
 
 
 def whole_page(title: str, lead: str, opening: Sequence[Markup], sections: Sequence[Section]) -> str:
@@ -46,6 +47,11 @@ def whole_page(title: str, lead: str, opening: Sequence[Markup], sections: Seque
 def page_part(name: str, *values: object) -> Markup:
     macros = _environment().get_template("parts.html.j2").module
     return Markup(getattr(macros, name)(*values))
+
+
+def page_text(part: str) -> Markup:
+    """HTML of a part: HTML stays unchanged, and a text becomes a paragraph."""
+    return part if isinstance(part, Markup) else page_part("paragraph", part)
 
 
 def table(sheet: Sheet) -> Markup:

@@ -3,6 +3,7 @@
 const MOST_AGENTS = 3;
 const FRAME_S = 0.04;
 const STEP_S = 0.1;
+const BEFORE_S = 1; // the page opens this long before the first impact
 
 class Player {
   constructor(root, data) {
@@ -18,6 +19,9 @@ class Player {
     this.listen();
     this.choose(0);
     root.classList.add("ready");
+    this.jump(1);
+    this.seek(this.time - BEFORE_S);
+    this.play(!this.calm.matches);
   }
 
   fillChoices() {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -20,10 +20,11 @@ from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.figures import harm_above, harm_by_agent
-from ethbrake_marl.extensions.report.page import Section, drawing, page_part, table, whole_page
+from ethbrake_marl.extensions.report.page import Section, drawing, page_part, page_text, table, whole_page
 from ethbrake_marl.files.sheet import CellText, Column, Sheet
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Bools
+from ethbrake_marl.names import AGENTS, WRAPPERS
 
 LEARNED_AGENTS = ("trained policy", "trained team")  # names that get an article
 COUNTED_WORDS = {  # count -> verb, noun, and what is counted
@@ -87,6 +88,17 @@ def value(row: SummaryRow, key: str) -> str:
 
 
 SHORT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the first table, if they are shown
+HONEST_COST = {
+    "Honest cost": "Total harm, plus penalties for pushing a vehicle, for impacts passed on through touching vehicles,"
+    " for speeding up, and for motion at the end. Unlike harm alone, it cannot be lowered by pushing."
+}
+LEARNED = {  # names that this package gives to what a run has learned
+    "trained policy": "the policy that this run trained",
+    "hybrid": "the paper's hybrid: the trained policy or E-V2X-BM drives the whole episode",
+    "trained team": "the policies that this run trained, one for each learner",
+    "shielded team": "the trained team with a shield, which replaces actions that could do more harm",
+}
+PAIRWISE = "the paper's E-V2X-BM: the constant deceleration of its closed form, which treats pairs as independent"
 GLOSSARY = {
     "Contact": "Two vehicles, or Vehicle 1 and an obstacle, touch: the gap between them is 0.",
     "Impact": "A contact with a closing speed above 0. The square of that speed is its harm.",
@@ -123,33 +135,56 @@ class ReportPage:
         about = rows.parameters
         versions = {**about["versions"], **{key: about[key] for key in IDENTITY[:3]}}
         sections = [
-            Section("Results", [self.summary, page_part("box", "Three words", GLOSSARY), *measure_parts(rows)]),
-            *self.sections,
-            episodes_section(compared, focus, kinds),
-            worst_section(compared, focus, kinds),
-            avoidable_section(compared),
-            Section("Figures", self.figures),
             *(Section(title, _test_body(test)) for title, test in self.tests.items()),
-            Section("How to read the tables", [page_part("facts", rows.meanings())]),
-            Section("Settings and seeds", [page_part("facts", self.settings)]),
-            Section("Versions", [page_part("facts", versions)]),
+            Section("Learning curve", self.figures[:1]),
+            *self.sections,
+            worst_section(compared, focus, kinds),
+            Section("Agents and measures", [self.summary, *measure_parts(rows)], folded=True),
+            avoidable_section(compared)._replace(folded=True),
+            Section("Figures", self.figures[1:], folded=True),
+            Section("How to read the tables", [page_part("facts", GLOSSARY | rows.meanings())], folded=True),
+            Section("Settings and seeds", [page_part("facts", self.settings)], folded=True),
+            Section("Versions", [page_part("facts", versions)], folded=True),
         ]
         marks = "; marks: the other tests" if test_results else ""
         bars = harm_by_agent(compared, test_results)
         words = IN_WORDS[compared.harm_count].capitalize()
         harm = drawing(bars, f"{words} of each agent", f"Mean and 95 % interval{marks}.")
-        opening = [page_part("remarks", [*self.remarks, *rows.notes()]), page_part("beside", harm, short_table(rows))]
+        opening = [
+            page_part("remarks", [*self.remarks, *rows.notes()]),
+            page_part("beside", short_table(rows, compared.harm_count), harm),
+            page_part("box", "What is compared", HONEST_COST | agents_in_words(compared.teams)),
+            *map(page_text, episodes_section(compared, focus, kinds).body),
+        ]
         lead = first_sentence(compared, focus, test_results)
+        sections.sort(key=lambda section: section.folded)
         return whole_page(self.title, lead, opening, [section for section in sections if section.body])
 
     def write(self, path: Path, *, force: bool = False) -> None:
         write_output(path, self.html.encode("utf-8"), force=force)
 
 
-def short_table(agents: SummaryTable) -> Markup:
-    sheet = agents.sheet()
-    some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or name in SHORT)
-    return table(replace(some, title="Means with 95 % intervals, m²/s²"))
+def agents_in_words(teams: Iterable[str]) -> dict[str, str]:
+    """What each agent does, in one line; without agents of the user, about whom nothing is known."""
+    words = {}
+    for team in teams:
+        core, *wrappers = team.split("+")
+        name, _, argument = core.partition("@")[0].partition(":")
+        if team in LEARNED:
+            words[team] = LEARNED[team]
+        elif name in AGENTS and "/" not in core.partition("@")[0]:
+            about = PAIRWISE if (name, argument) == ("e_v2x_bm", "pairwise") else AGENTS[name].about
+            guards = (WRAPPERS[wrapper.partition(":")[0]].about for wrapper in wrappers)
+            words[team] = "; ".join([about, *guards])
+    return words
+
+
+def short_table(agents: SummaryTable, harm_count: str) -> Markup:
+    """Table of the most important columns. The count that agents minimise comes first, so that a phone shows it."""
+    sheet, first = agents.sheet(), COLUMN[harm_count]
+    chosen = [k for k, name in enumerate(sheet.names) if name in SHORT]
+    chosen.sort(key=lambda k: sheet.names[k] != first)
+    return table(replace(sheet.only([0, *chosen]), title="Means with 95 % intervals, m²/s²"))
 
 
 def measure_parts(agents: SummaryTable) -> list[Markup]:
@@ -241,7 +276,7 @@ def _harm_among(compared: Compared, best_known: BestKnown, where: str, among: Bo
 def _test_body(test: Test) -> list[str]:
     rows = test.compared.table
     notes = [page_part("paragraph", text, "note") for text in rows.notes()]
-    return [test.about, short_table(rows), *notes, *measure_parts(rows)]
+    return [test.about, short_table(rows, test.compared.harm_count), *notes, *measure_parts(rows)]
 
 
 def write_evaluation(path: Path, compared: Compared, command: str, *, force: bool = False) -> None:

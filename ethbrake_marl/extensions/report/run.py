@@ -181,7 +181,7 @@ def report_page(
     sections = [Section("Several learners", [table(sheet) for sheet in learners])]
     if is_papers_test(compared.scenario):
         printed = [table(printed_sheet(rows)) for rows in (RANDOM_TEST, HYBRID_TEST)]
-        sections.append(Section("The paper's rows", [*printed, PAPER_NOTE]))
+        sections.append(Section("The paper's rows", [*printed, PAPER_NOTE], folded=True))
     stopped = f"The training was interrupted. This is the {learned} after {steps:,} steps."
     return ReportPage(
         f"ethbrake run: {name}",

@@ -1,11 +1,14 @@
 """``study front`` as a user types it."""
 
 import json
+import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image
 
+from ethbrake_marl.extensions.cooperation import front
 from tests.fixtures.commands import Command, Refuse, told_json
 
 SMALL = "--episodes 20 --steps 1 --budget 100"
@@ -65,3 +68,25 @@ def test_front__does_not_replace_results(ethbrake: Command, empty_folder: Path) 
     Path("out/front.json").write_text("mine")
     answer = ethbrake(*f"study front {SMALL} --output out".split())
     assert answer.status == 2 and "front.json" in answer.err and Path("out/front.json").read_text() == "mine"
+
+
+def test_front__interrupted_keeps_the_worlds_that_are_finished(
+    ethbrake: Command, empty_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, some = "study front --weights 1,1,1 --episodes 2 --budget 20 --output two", "--episodes 5 --output five"
+    assert ethbrake(*whole.split()).status == 0
+    monkeypatch.setattr(front, "FRONT_CHUNK", 2)
+    search = front.search_profiles
+
+    def interrupted(*arguments: Any, **settings: Any) -> Any:
+        if front.FRONT_CHUNK == 2:
+            signal.raise_signal(signal.SIGINT)
+            monkeypatch.setattr(front, "FRONT_CHUNK", 3)
+        return search(*arguments, **settings)
+
+    monkeypatch.setattr(front, "search_profiles", interrupted)
+    answer = ethbrake(*f"{whole} {some}".split())
+    assert answer.status == 130 and "the results are those of the first 2 worlds" in answer.err
+    assert "front: 10 searches with 100 candidates or more (--episodes 100 --steps 1: 14,000)" in answer.err
+    two, five = (json.loads(Path(folder, "front.json").read_text()) for folder in ("two", "five"))
+    assert two == five

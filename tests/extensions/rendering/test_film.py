@@ -9,9 +9,12 @@ import pytest
 from PIL import Image, ImageSequence
 
 import ethbrake_marl as eb
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.rendering import viewer
 from ethbrake_marl.extensions.rendering.film import film, film_scenes
 from ethbrake_marl.names import teams_of
 from tests.fixtures.commands import Command, Refuse
+from tests.programmes.figures import frames, unequal_share
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 # Vehicle 2, 6 m/s faster, strikes Vehicle 1 after 0.95 s: harm 36. The horizon is 1.3 s.
@@ -49,17 +52,61 @@ def test_film__plays_in_real_time_and_ends_with_the_longest(ending: str, tmp_pat
         return
     shown = Image.open(io.BytesIO(path.read_bytes()))
     assert (shown.n_frames, shown.size) == (34, (800, 608))
-    assert {frame.info["duration"] for frame in ImageSequence.Iterator(shown)} == {40}
+    assert [frame.info["duration"] for frame in ImageSequence.Iterator(shown)] == [*33 * [40], 2000]
 
 
-def test_watch__makes_the_picture_of_the_readme(ethbrake: Command, empty_folder: Path) -> None:
+def test_watch__makes_the_film_of_the_readme(ethbrake: Command, empty_folder: Path) -> None:
     pytest.importorskip("ethbrake_marl.extensions.forecasts")  # which `universal` observes
-    answer = ethbrake("watch", "--agents", "full_brake,universal", "--output", "now.png")
-    assert (answer.status, answer.out, answer.err) == (0, "", "pictures: now.png\n")
-    now, then = (Image.open(file).convert("RGB") for file in ("now.png", DOCS / "figures" / "emergency.png"))
-    assert now.size == then.size
+    file = DOCS / "figures" / "emergency.gif"
+    answer = ethbrake("watch", "--agents", "full_brake,universal", "--output", "now.gif")
+    assert (answer.status, answer.out, answer.err) == (0, "", "film: now.gif\n")
+    now, then = map(frames, (Path("now.gif"), file))
     # Pillow 11.3 draws 0.1 % of the points otherwise than Pillow 13; with another agent 3 % are others.
-    assert (np.abs(np.array(now, int) - np.array(then, int)).max(axis=2) > 8).mean() < 5e-3
+    assert unequal_share(now, then) < 5e-3 and file.stat().st_size < 1e6
+
+
+def test_readme_film__shows_every_impact() -> None:
+    pytest.importorskip("ethbrake_marl.extensions.forecasts")
+    for agent, speeds in (("full_brake", ["2.4", "5.3"]), ("universal", ["3.5", "0.5"])):
+        shown = [str(impact) for scene in scenes_of("paper-random", agent) for impact in scene.impacts]
+        assert [text.split(" at ")[1] for text in dict.fromkeys(shown)] == [f"{speed} m/s" for speed in speeds]
+        assert all(shown.count(text) >= 7 for text in shown)  # 0.3 s each
+
+
+def test_watch__without_a_file_opens_a_window_or_writes_one(
+    ethbrake: Command, empty_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pygame = pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
+    shown: list[tuple[int, ...]] = []
+    monkeypatch.setattr(viewer.Screen, "show", lambda screen, frame, fps: shown.append(frame.shape) or len(shown) < 5)
+    answer = ethbrake("watch", "--agents", "coast")
+    assert (answer.status, answer.err, [*empty_folder.iterdir()]) == (0, "", [])
+    assert shown == 5 * [(304, 800, 3)]  # then the user closes the window
+    pygame.display.quit()
+    monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
+    answer = ethbrake("watch", "--agents", "coast")
+    assert answer.status == 0 and "cannot open a window" in answer.err and "film: watch.gif" in answer.err
+    assert Path("watch.gif").stat().st_size > 1e5
+
+
+def test_watch__offscreen_is_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SDL draws offscreen without any display, unless the user asks for it."""
+    pygame = pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
+    monkeypatch.delenv("SDL_VIDEODRIVER")
+    monkeypatch.setattr(pygame.display, "get_driver", lambda: "offscreen")
+    monkeypatch.setattr(pygame.display, "init", lambda: None)
+    with pytest.raises(InvalidInput, match=r"cannot open a window \(there is no display\)"):
+        viewer.Screen(np.zeros((304, 800, 3), np.uint8))
+
+
+def test_watch__prints_the_alert_every_impact_and_the_end(ethbrake: Command, empty_folder: Path) -> None:
+    answer = ethbrake("watch", "--agents", "full_brake,coast", "--output", "-")
+    times = [line.split("  ")[1] for line in answer.out.splitlines() if line.startswith("full_brake: world 0")]
+    assert times == [f"{time} s after the alert" for time in ("0.00", "2.20", "3.32")] + [
+        "3.90 s after the alert (ended)"
+    ]
+    assert "impact of Vehicles 2 and 3 at 5.3 m/s, 3.30 s" in answer.out and "coast: world 0" in answer.out
+    assert [*empty_folder.iterdir()] == []
 
 
 def test_watch__is_refused(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -153,9 +153,9 @@ def test_human__shows_each_step_in_real_time(monkeypatch: pytest.MonkeyPatch) ->
     environment.step(np.zeros(1, np.float32))
     assert pygame.time.get_ticks() - before >= 80  # a step of 0.1 s
     assert environment.render() is None
-    assert environment.renderer.window.size == (800, 304)
+    assert environment.renderer.window.window.size == (800, 304)
     copy.deepcopy(environment).close()
-    pygame.event.post(pygame.event.Event(pygame.WINDOWCLOSE, window=other.renderer.window))
+    pygame.event.post(pygame.event.Event(pygame.WINDOWCLOSE, window=other.renderer.window.window))
     for _ in range(2):
         environment.step(np.zeros(1, np.float32))
         other.step(np.zeros(1, np.float32))

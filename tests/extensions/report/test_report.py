@@ -24,8 +24,10 @@ from ethbrake_marl.extensions.report.episodes import (
 from ethbrake_marl.extensions.report.report import (
     ReportPage,
     Test as OtherTest,
+    agents_in_words,
     avoidable_section,
     first_sentence,
+    short_table,
     worst_section,
 )
 from ethbrake_marl.extensions.report.run import learners_sheets
@@ -285,3 +287,15 @@ def test_page__hostile_names_are_text_everywhere() -> None:
     assert page.open == [] and not set(html) & UNSEEN and html.count("<script") == 2
     assert not any(key.startswith("on") for _, attributes in page.tags for key in attributes)
     assert [len(world["episodes"]) for world in player_data(html)["worlds"]] == [len(agents)] * 3
+
+
+def test_first_table__begins_with_the_count_that_agents_minimise() -> None:
+    for count, words in (("honest", "Honest cost"), ("total", "Total harm")):
+        text = str(short_table(compared_by("paper-random", "full_brake,coast", 20, count).table, count))
+        assert re.findall(r'<th scope="col">([^<]+)</th>', text)[:2] == ["Agent", words]
+
+
+def test_agents_in_words__name_every_agent_of_this_package() -> None:
+    words = agents_in_words(["e_v2x_bm:pairwise", "ppo@runs/x+step", "mine", "hybrid", "./mine.py:make"])
+    assert [*words] == ["e_v2x_bm:pairwise", "ppo@runs/x+step", "hybrid"]
+    assert "closed form" in words["e_v2x_bm:pairwise"] and words["ppo@runs/x+step"].endswith("certified, or replaced")

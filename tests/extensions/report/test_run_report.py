@@ -1,6 +1,7 @@
 """What the report adds to the folder of a run, and pages of commands."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,18 @@ def test_run__leaves_results_pictures_page_and_policy(finished_run: Path) -> Non
     assert "Nothing in this package is tuned to these rows" in page.text and "33.5878" in page.text
     assert "ethbrake run: paper-random" in page.text and "256 steps of 256 (finished)" in page.text
     titles = [attributes.get("id") for tag, attributes in page.tags if tag == "section"]
-    assert {"results", "episodes", "worst-ten-worlds", "figures", "brake-only-test", "obstacle-test"} <= {*titles}
+    assert titles[:4] == ["brake-only-test", "obstacle-test", "learning-curve", "worst-ten-worlds"]
+    assert {"agents-and-measures", "the-paper's-rows", "figures", "versions"} <= {*titles[4:]}
+    assert len(re.findall(r"<details><summary>\s*<h2", html)) == len(titles) - 4  # all others are folded
+    header, main = html.split("<main")
+    assert 'class="player"' in header and 'class="player"' not in main  # an episode plays before any section
+    for words in (
+        "Honest cost",
+        "e_v2x_bm:<wbr>pairwise",
+        "the constant deceleration of its closed form",
+        "the policy that this run trained",
+    ):
+        assert words in header
     assert status_of(finished_run, "status", "stage", "steps", "reason") == ("finished", "evaluation", 256, None)
     assert {*status_of(finished_run, "written")[0]} >= {"report.html", *PICTURES, *others}
 

@@ -1,0 +1,183 @@
+"""``docs/reference/environment.md``: ``python -m tests.docs.card`` makes it from the package, a test compares it."""
+
+import argparse
+import re
+from inspect import Parameter, getdoc, signature
+from pathlib import Path
+
+import ethbrake_marl as eb
+from ethbrake_marl.episode import infos
+from ethbrake_marl.episode.features import FEATURES, GROUPS, Feature, known_names
+from ethbrake_marl.episode.reward import REWARDS
+from ethbrake_marl.episode.terms import BUILT_IN
+from ethbrake_marl.faces.registration import GYMNASIUM_ID, MO_GYMNASIUM_ID, PETTINGZOO_ID
+from tests.docs.site import DOCS
+
+PAGE = DOCS / "reference" / "environment.md"
+DOORS = {
+    "PettingZoo": eb.EthBrakeParallelEnv,
+    "Gymnasium": eb.EthBrakeEnv,
+    "vector": eb.EthBrakeVectorEnv,
+    "SB3": eb.make_sb3_vec_env,
+}
+USUAL = eb.View().features
+TEXT = """# The environment: {gymnasium}
+
+Which numbers go in, and which come out? This page is made from the code by `python -m
+tests.docs.card`. How to use the environment: [environments](../environments.md).
+
+| | |
+|---|---|
+| Action space | `{action}` |
+| Observation space | `{observation}` for `paper-random` |
+| Gymnasium | `gymnasium.make("{gymnasium}")`, `gymnasium.make_vec("{gymnasium}", num_envs=n)`; vector rewards: `{mo}` |
+| PettingZoo | `eb.parallel_env()`, `eb.env()`; from PettingZoo 1.27 on `pettingzoo.make("parallel", "{pettingzoo}")` |
+| Stable-Baselines3 | `eb.make_sb3_vec_env("paper-random", n_envs=n)` |
+
+## Action
+
+One number: -1 brakes with full capacity, 0 coasts, +1 drives with full capacity, linear on each
+side of 0. It takes effect once the vehicle's latency since the alert has elapsed, and stays in force
+for one time step, usually 0.1 s. With `actions=K`, an index of K evenly spaced numbers.
+
+## Observation
+
+By default these {count} numbers, in this order. An observed number is the quantity divided by *scale*,
+clipped to *bounds*. **All numbers of a neighbour that the vehicle does not know are 0**: before its own
+latency has elapsed, before it sees the neighbour or receives its first message, or if there is none.
+
+{usual}
+
+`front_2` to `front_64` and `rear_2` to `rear_64` have the same numbers as `front_1`, for vehicles
+farther away. More numbers, which `observation=[...]` or a scenario chooses, by name or by group:
+
+{more}
+
+## Reward
+
+The default, for every vehicle: minus the harm of the step, `r = - sum w^2` over the first impacts of
+all pairs in the step, with the closing speed `w` in m/s before the impact. In general
+`r = sum weight x term`:
+
+{rewards}
+
+{terms}
+
+`harm_count` is `first` (first impact of each pair), `total` (every impact) or `honest` (total harm and
+the [price of conduct](../game.md#the-honest-cost)). Rewards are large before a policy has learned
+anything (honest cost of random actions on `paper-random`: about 550 m²/s² an episode; full braking:
+31), so most learners need a scale, for instance `reward={{"harm": 0.05, "harm_count": "honest"}}`.
+
+## Start and end
+
+- **Start**: at the alert Vehicle 1 brakes. `reset` returns the observation at the moment when the
+  latency of the first learner has elapsed. `reset(seed=s)` starts the first training world of seed
+  s, `reset()` the next one; [`options`](../environments.md#episodes-and-seeds) choose a world.
+- **Terminated**: every vehicle is at rest, and no command would move it.
+- **Truncated**: at the scenario's `horizon_s` (usually 8 s), or after `max_cycles` steps.
+  All vehicles end together.
+
+## Infos
+
+The same keys after a reset and after every step:
+
+{infos}
+
+## Arguments
+
+{arguments}
+
+## Versions
+
+- `EthBrake-v2`: the honest cost prices the engine's force and charges a push to its author; an end
+  after `max_cycles` is known to rewards; light vehicles with restitution 0 have all their impacts.
+- `EthBrake-v1`: in version 1.0 of this package.
+
+[The changelog](../../CHANGELOG.md) lists everything that changed.
+"""
+
+
+def table(headings: list[str], rows: list[list[str]]) -> str:
+    return "\n".join(f"| {' | '.join(row)} |" for row in (headings, ["---"] * len(headings), *rows))
+
+
+def zero_of(feature: Feature) -> str:
+    """What the number 0 says, beside the value 0."""
+    group, _, name = feature.name.rpartition(".")
+    beside = "" if group in ("", "own", "role") else ", or unknown"
+    if name.endswith("known"):
+        return "unknown, or there is none"
+    if name == "hit":
+        return "no impact so far"
+    return f"0 {feature.unit}".removesuffix(" 1") + beside
+
+
+def feature_rows(features: tuple[Feature, ...]) -> list[list[str]]:
+    rows = []
+    for f in features:
+        meaning = f.meaning.rstrip(".").replace(", [n] s", "")
+        rows.append([f"`{f.name}`", meaning, f.unit, f"{f.scale:g}", f"{f.low:g} to {f.high:g}", zero_of(f)])
+    return rows
+
+
+def more_features() -> list[list[str]]:
+    """Rows of all features outside the default, without those of neighbours farther away."""
+    rows = feature_rows(eb.View(["role", "obstacle"]).features)
+    singles = [name if name in known_names() else f"front_1.{name}" for name in FEATURES]
+    rows += feature_rows(eb.View(singles).features)
+    for name in GROUPS:
+        count = len(eb.View([name]).features)
+        meaning = "[forecasts](../extensions/learners.md#forecasts) of the next impacts"
+        rows.append([f"`{name}`", f"{count} {meaning}", "", "", "", ""])
+    return rows
+
+
+def info_rows() -> list[list[str]]:
+    lines = re.findall(r"^(\w[\w, ]*?)  +(\S.*)$", infos.__doc__ or "", re.MULTILINE)
+    return [[", ".join(f"`{n}`" for n in names.split(", ")), meaning.replace("``", "`")] for names, meaning in lines]
+
+
+def argument_rows() -> list[list[str]]:
+    """Each argument of an environment: default, interfaces, meaning (of the first docstring that has it)."""
+    meanings: dict[str, str] = {"n_envs": "number of worlds"}
+    for door in DOORS.values():
+        listed = (getdoc(door) or "").replace("- ``", "").replace("``:", ":")
+        for name, text in re.findall(r"^ {0,4}(\w+): (.*?)(?=^ {0,4}\w+: |^$)", listed, re.MULTILINE | re.DOTALL):
+            meanings.setdefault(name, " ".join(text.split()).replace("``", "`").rstrip("."))
+    rows: dict[str, list[str]] = {}
+    for door, function in DOORS.items():
+        for name, parameter in signature(function).parameters.items():
+            value = getattr(parameter.default, "value", parameter.default)
+            default = "required" if value is Parameter.empty else f"`{value!r}`"
+            rows.setdefault(name, [f"`{name}`", meanings.get(name, ""), default, ""])
+            rows[name][3] += f"{', ' if rows[name][3] else ''}{door}"
+    return list(rows.values())
+
+
+def page() -> str:
+    env = eb.EthBrakeEnv()
+    rewards = [
+        [f"`{name}`", ", ".join(f"{weight:g} `{term}`" for term, weight in params.weights.items() if weight),
+         f"`{params.harm_count}`"]
+        for name, params in REWARDS.items()
+    ]  # fmt: skip
+    return TEXT.format(
+        gymnasium=GYMNASIUM_ID,
+        mo=MO_GYMNASIUM_ID,
+        pettingzoo=PETTINGZOO_ID,
+        action=env.action_space,
+        observation=f"Box({env.observation_space.shape}, {env.observation_space.dtype})",
+        count=len(USUAL),
+        usual=table(["number", "meaning", "unit", "scale", "bounds", "0 means"], feature_rows(USUAL)),
+        more=table(["number", "meaning", "unit", "scale", "bounds", "0 means"], more_features()),
+        rewards=table(["reward", "weights", "`harm_count`"], rewards),
+        terms=table(["term", "value in a step", "unit"], [[f"`{n}`", m, u] for n, (u, m) in BUILT_IN.items()]),
+        infos=table(["key", "meaning"], info_rows()),
+        arguments=table(["argument", "meaning", "default", "interfaces"], argument_rows()),
+    )
+
+
+if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    PAGE.write_text(page(), "utf-8")
+    print(Path(PAGE).relative_to(DOCS.parent))

@@ -1,0 +1,144 @@
+"""What Windows and macOS lack or do otherwise, as far as Linux can imitate it."""
+
+import io
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl import kernel_store
+from ethbrake_marl.files import store
+from ethbrake_marl.parallel import run_each
+from ethbrake_marl.worlds.explain import new_scenario_text
+
+WITHOUT = """
+import os, signal, sys, sysconfig
+sysconfig.get_config_vars()
+for module, names in ((os, {os_names!r}), (signal, {signal_names!r}), (sys, ("abiflags",))):
+    for name in names:
+        vars(module).pop(name, None)
+import ethbrake_marl.cli.app as app
+sys.exit(app.run_command({arguments!r}))
+"""
+OS_NAMES = ("fork", "getuid", "geteuid", "sched_getaffinity", "mkfifo", "killpg", "getpgid", "O_NOFOLLOW", "O_NONBLOCK")
+SIGNAL_NAMES = ("pthread_sigmask", "SIGHUP", "SIGKILL", "SIGPIPE", "SIGALRM", "setitimer", "SIGUSR1")
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["evaluate --episodes 3 --agents full_brake,ppo --jobs 2 --output out", "doctor", "watch --output film.gif"],
+)
+def test_command__without_functions_that_only_unix_has(words: str, empty_folder: Path) -> None:
+    program = WITHOUT.format(os_names=OS_NAMES, signal_names=SIGNAL_NAMES, arguments=words.split())
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii", "cp437"])
+def test_table__can_be_printed_on_every_console(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the command, and in Python."""
+    environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0", "COLUMNS": "100"}
+    command = [sys.executable, "-m", "ethbrake_marl", "evaluate", "--episodes", "3", "--agents", "full_brake"]
+    done = subprocess.run(command, capture_output=True, env=environment, check=False)
+    assert done.returncode == 0 and "full_brake" in done.stdout.decode(encoding), done.stderr
+    table = eb.summarise(eb.evaluate("paper-random", "full_brake", episodes=3))
+    console = io.TextIOWrapper(io.BytesIO(), encoding)
+    with redirect_stdout(console):
+        print(table)
+    console.flush()
+    assert "full_brake" in console.buffer.getvalue().decode(encoding)  # type: ignore[attr-defined]
+
+
+def test_files__with_windows_line_ends_are_read_alike(empty_folder: Path) -> None:
+    text = new_scenario_text("mine")
+    rows = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n7,8,20,18,20\n6,9,19,20,21\n"
+    agent = "import ethbrake_marl as eb\n\ndef make():\n    return eb.make_agent('coast')\n"
+    results = []
+    for end in ("\n", "\r\n"):
+        for name, content in (("mine.yaml", text), ("rows.csv", rows), (f"mine{len(end)}.py", agent)):
+            Path(name).write_bytes(content.replace("\n", end).encode())
+        worlds = eb.read_worlds("paper-random", "rows.csv")
+        result = eb.evaluate("mine.yaml", f"mine{len(end)}.py:make", episodes=2)[f"mine{len(end)}.py:make"]
+        content = eb.load_scenario("mine.yaml").content()
+        results.append((content, result["total_harm"].tolist(), worlds.gaps_m.tolist()))
+    assert results[0] == results[1]
+
+
+def test_stored_code__that_another_process_reads_stays_without_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    """Windows refuses to replace a file that is open."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(kernel_store, "_warned", [])
+    kernel_store.save_data("a", b"code")
+
+    def refuse(source: object, target: object) -> None:
+        raise PermissionError(13, "The process cannot access the file", str(target))
+
+    monkeypatch.setattr(store.os, "replace", refuse)
+    kernel_store.save_data("a", b"code")
+    assert not recwarn.list and kernel_store.load_data("a", bytes) == b"code"
+    kernel_store.save_data("b", b"code")
+    assert "every process compiles the physics again" in str(recwarn.pop().message)
+
+
+def test_run__is_replaced_without_an_open_file_in_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows refuses to move a folder with an open file, such as a lock that is held."""
+    from ethbrake_marl.training.run import RunFolder
+
+    run = RunFolder(tmp_path / "run")
+    run.create({})
+    moved = store.remove_folder
+
+    def check(path: Path) -> None:
+        opened = {os.path.realpath(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd")}
+        assert not [name for name in opened if name.startswith(f"{path}{os.sep}")]
+        moved(path)
+
+    monkeypatch.setattr(store, "remove_folder", check)
+    run.create({"new": 1}, force=True)
+    assert "new" in run.config.read_text()
+
+
+def test_written_file__is_flushed_through_a_handle_that_can_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import fcntl
+
+    modes = []
+    monkeypatch.setattr(store.os, "fsync", lambda fd: modes.append(fcntl.fcntl(fd, fcntl.F_GETFL) & os.O_ACCMODE))
+    store.write_file(tmp_path / "file", b"x")
+    assert modes == [os.O_RDWR]
+
+
+def test_names_of_files__differ_in_more_than_case_and_have_no_character_that_windows_forbids() -> None:
+    listed = subprocess.run(["git", "ls-files"], capture_output=True, text=True, check=False).stdout.splitlines()
+    if not listed:
+        pytest.skip("not in a git repository")
+    assert len({name.lower() for name in listed}) == len(listed)
+    assert not [name for name in listed if set('<>:"|?*\\') & {*name} or len(name) > 120]
+    parts = {Path(part).stem.lower() for name in listed for part in name.split("/")}
+    assert not parts & {"con", "prn", "aux", "nul", "com1", "lpt1"}
+
+
+def test_long_path__holds_results_and_a_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path.joinpath(*["a folder with a long name " + "x" * 40] * 12)
+    folder.mkdir(parents=True)
+    monkeypatch.chdir(folder)
+    Path("mine.yaml").write_text(new_scenario_text("mine"))
+    Path("out").mkdir()
+    table = eb.summarise(result := eb.evaluate(folder / "mine.yaml", "coast", episodes=2))
+    assert [path.is_file() for path in eb.write_results(folder / "out", table, result, rows="csv")] == [True, True]
+    shutil.rmtree(folder / "out")
+
+
+def test_workers__are_started_without_fork(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on Windows and macOS: no memory of the parent is shared."""
+    pytest.importorskip("joblib")
+    monkeypatch.setattr(os, "fork", lambda: pytest.fail("fork"))
+    assert [*run_each([(divmod, 7, 2), (divmod, 9, 4)], 2)] == [(3, 1), (2, 1)]
