@@ -36,19 +36,8 @@ def film_scenes(world: State, team: Team, game: Game) -> list[Scene]:
     return scenes
 
 
-def film(world: State, teams: Mapping[str, Team], ending: str, game: Game) -> bytes:
-    """Films of teams that drive the same world, one below the other, as the content of one file.
-
-    ``teams``: title -> team. A film that ends early shows its last scene until all films have ended. ``ending``:
-    ``.gif`` or ``.mp4``; or ``.png`` for stills of three moments: the alert, the hardest impact under any team, and the
-    end. Raises ``InvalidInput`` for any other ending, and ``MissingExtra`` for ``.mp4`` if imageio-ffmpeg is not
-    installed.
-    """
-    check_film(ending)
-    return WRITERS[ending](films_of(world, teams, game))
-
-
 def films_of(world: State, teams: Mapping[str, Team], game: Game) -> Films:
+    """Films of teams that drive the same world. ``teams``: title -> team."""
     return {title: film_scenes(world, team, game) for title, team in teams.items()}
 
 
@@ -67,6 +56,7 @@ Films = Mapping[str, Sequence[Scene]]  # title -> scenes, of one world
 
 
 def stack_films(films: Films) -> Iterator[Frame]:
+    """Pictures of all films, one below the other. A film that ends early shows its last scene until all have ended."""
     for k in range(max(map(len, films.values()))):
         frame_scenes = (scenes[min(k, len(scenes) - 1)]._replace(title=title) for title, scenes in films.items())
         yield np.concatenate([picture(scene) for scene in frame_scenes])

@@ -11,7 +11,7 @@ from PIL import Image, ImageSequence
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.rendering import viewer
-from ethbrake_marl.extensions.rendering.film import film, film_scenes
+from ethbrake_marl.extensions.rendering.film import WRITERS, film_scenes, films_of
 from ethbrake_marl.names import teams_of
 from tests.fixtures.commands import Command, Refuse
 from tests.programmes.figures import frames, unequal_share
@@ -45,7 +45,7 @@ def test_film__plays_in_real_time_and_ends_with_the_longest(ending: str, tmp_pat
     scenario, game = eb.open_game(CRASH)
     teams = {name: teams_of(agent, scenario)[agent] for name, agent in (("a", "coast"), ("b", "full_brake"))}
     path = tmp_path / "film"
-    path.write_bytes(film(scenario.sample(1, 7), teams, ending, game))
+    path.write_bytes(WRITERS[ending](films_of(scenario.sample(1, 7), teams, game)))
     if ending == ".mp4":
         library = pytest.importorskip("imageio_ffmpeg", reason="needs the extra: pip install 'ethbrake-marl[render]'")
         assert library.count_frames_and_secs(str(path)) == (34, pytest.approx(34 / 25, abs=0.02))
