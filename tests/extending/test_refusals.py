@@ -89,7 +89,7 @@ def test_part__of_a_name_that_is_there_is_refused(message: str) -> None:
 
 NAMES: dict[str, Callable[[], object]] = {
     "unknown feature 'zzz'; known: ": lambda: eb.View(["own", "zzz"]),
-    "unknown setting of a reward 'jrek'; did you": lambda: eb.parallel_env(scenario=PAPER, reward={"jrek": 1.0}),
+    "unknown term or setting of a reward 'jrek'": lambda: eb.parallel_env(scenario=PAPER, reward={"jrek": 1.0}),
     "unknown objective 'onw'; did you mean": lambda: PAPER.replace(objective="onw"),
     "unknown measure 'pushed_n'; did you mean": lambda: eb.evaluate(PAPER, "coast", episodes=2, measures="pushed_n"),
     "unknown agent 'caost'; did you mean": lambda: eb.make_agent("caost"),
