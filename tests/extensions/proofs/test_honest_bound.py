@@ -267,7 +267,7 @@ def test_bound__is_near_the_best_known_cost_and_never_above_it(name):
 
 
 CONDITIONS = {
-    "brakes less than its neighbours": dict(braking=[8, 7, 8]),
+    "brakes less than its neighbours": dict(braking=[7.1, 7, 7.1]),
     "may be thrown back": dict(mass=[60, 5.5, 5.9], restitution=0.5),
     "may throw the rear vehicle back": dict(mass=[4.5, 60, 5.9], restitution=0.5),
     "touches": dict(gaps=[0, 7]),
