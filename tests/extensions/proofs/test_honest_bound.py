@@ -251,7 +251,11 @@ def test_bound__no_plan_is_below_it_in_random_worlds():
     assert (bounds > 1).sum() > 50 and (least >= bounds[inside]).all()
 
 
-LISTS = {"paper-random": 0.92, "paper-random-brake-only": 0.93}
+# the bounds of the first six worlds, and the least share of the best known cost
+LISTS = {
+    "paper-random": ([11.1524903071582, 61.76126649996715, 0.0, 0.0, 0.0, 24.887458787442657], 0.94),
+    "paper-random-brake-only": ([11.152546422827951, 62.38885023047322, 0.0, 0.0, 0.0, 24.887459010024514], 0.94),
+}
 
 
 @pytest.mark.parametrize("name", LISTS)
@@ -260,14 +264,15 @@ def test_bound__is_near_the_best_known_cost_and_never_above_it(name):
     worlds, steps = scenario.sample(30, seed=7), dict(horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
     best = BestHarmTable.load(TABLE_FOLDER / f"{name}.npz").harm["honest"][:30]
     honest, total = (lower_bound(worlds, count=count, **steps) for count in ("honest", "total"))
-    assert (honest.harm <= best + 1e-9).all() and honest.harm.mean() > LISTS[name] * best.mean()
+    assert (honest.harm <= best + 1e-9).all() and honest.harm.mean() > LISTS[name][1] * best.mean()
+    assert honest.harm[:6] == pytest.approx(LISTS[name][0], rel=1e-9)
     assert (honest.harm >= total.harm).all() and total.harm.mean() < 0.6 * best.mean()
     any_time = [lower_bound(worlds, count=count, horizon_s=8.0).harm for count in ("honest", "total")]
     assert np.array_equal(*any_time)
 
 
 CONDITIONS = {
-    "brakes less than its neighbours": dict(braking=[8, 7, 8]),
+    "brakes less than its neighbours": dict(braking=[7.1, 7, 7.1]),
     "may be thrown back": dict(mass=[60, 5.5, 5.9], restitution=0.5),
     "may throw the rear vehicle back": dict(mass=[4.5, 60, 5.9], restitution=0.5),
     "touches": dict(gaps=[0, 7]),
