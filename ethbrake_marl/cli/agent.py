@@ -55,7 +55,7 @@ def agent_show(
         from ethbrake_marl.evaluation.door import evaluate
         from ethbrake_marl.names import make_agent
 
-        agent = make_agent(name)
+        agent = make_agent(name, scenario=scenario)
         if not isinstance(agent, LearnedAgent):
             raise InvalidInput(f"agent {name!r}: is no trained policy; name one, such as universal or policy@runs/mine")
         manifest = agent.policy.manifest

@@ -127,7 +127,8 @@ def more_features() -> list[list[str]]:
     rows += feature_rows(eb.View(singles).features)
     for name in GROUPS:
         count = len(eb.View([name]).features)
-        meaning = "[forecasts](../extensions/learners.md#forecasts) of the next impacts"
+        forecast = "the braking of least forecast cost, and what follows" if name == "plan" else "the next impacts"
+        meaning = f"[forecasts](../extensions/learners.md#forecasts): {forecast}"
         rows.append([f"`{name}`", f"{count} {meaning}", "", "", "", ""])
     return rows
 

@@ -303,8 +303,8 @@ def _entry(form: str, about: str) -> Part:
 
 
 IDM = _entry("idm[:T=1.5]", "the intelligent driver model")
-ACC = _entry("acc[:T=1.1]", "adaptive cruise control of PATH")
-CACC = _entry("cacc[:T=1.0]", "its cooperative one, at a shorter distance")
+ACC = _entry("acc[:T=1.1]", "adaptive cruise control of the PATH programme")
+CACC = _entry("cacc[:T=1.0]", "the cooperative one of the PATH programme, at a shorter distance")
 RSS = _entry("rss[:rho=1.0]", "brakes within the safe distance of RSS")
 R157_HUMAN = _entry("r157_human[:reaction=0.75]", "the careful and competent driver of UN R157")
 R157_FSM = _entry("r157_fsm[:reaction=0.75]", "the fuzzy safety model of UN R157")

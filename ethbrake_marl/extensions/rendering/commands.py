@@ -41,7 +41,8 @@ def watch_command(
     """Show a real-time film of agents that drive the same world.
 
     The film shows the road to scale, the commands, the impacts and the harm. A PNG file shows three moments: the alert,
-    the hardest impact, and the end; the text shows the alert, every impact, and the end.
+    the hardest impact under any agent, and the end; the text shows the alert, each pair's first impact in a time step,
+    and the end.
     """
     from ethbrake_marl.cli.settings import read_settings
     from ethbrake_marl.extensions.rendering.film import WRITERS, check_film, films_in_words, films_of, show_in_window

@@ -45,7 +45,7 @@ PROCESS_S = 10.0  # processor time of an item for the policies of the paper's pr
 
 CHANGES = Item(
     "changes", (), "Which one change makes a claim true?",
-    "Claims of the paper that differ here, the one change that makes each true or possible, and our numbers before and after.",
+    "Claims that differ here, the one change that makes each true or possible, and our numbers before and after.",
     reproduce_changes, 20,
 )  # fmt: skip
 
