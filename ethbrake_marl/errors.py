@@ -65,7 +65,7 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
         where = "" if error.lineno is None else f"line {error.lineno}: "
         return f"{where}{type(error).__name__}: {error.msg}"
     if isinstance(error, FileNotFoundError) and not os.path.isabs(error.filename or os.sep):
-        text += f"; a relative path begins in the current folder, {os.getcwd()}"
+        text += "; a relative path begins in the current folder"
     if path is not None:
         lines = [frame.lineno for frame in frames if frame.filename == path]
         return f"line {lines[-1]}: {text}" if lines else text

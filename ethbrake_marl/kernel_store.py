@@ -88,7 +88,8 @@ def announce_compilation() -> None:
     what = "parts of the physics" if _stored_files() else "the physics for the first time, which takes a minute or more"
     advice = "" if obstacle() else "; later processes use the stored result (in advance: ethbrake doctor --compile)"
     with suppress(AttributeError, OSError, ValueError):  # there is no stderr
-        print(f"compiling {what}{advice}", file=sys.stderr, flush=True)  # noqa: T201
+        sys.stderr.write(f"compiling {what}{advice}\n")
+        sys.stderr.flush()
 
 
 def _stored_files() -> list[Path]:

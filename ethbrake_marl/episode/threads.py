@@ -9,20 +9,21 @@ from concurrent.futures import ThreadPoolExecutor
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 
 LEAST_WORLDS = 16_384  # for fewer worlds a second thread costs more than it saves
+MOST_THREADS = 1024
 VARIABLE = "ETHBRAKE_THREADS"  # environment variable: number of threads where the caller sets none
 
 
 def chosen_threads(threads: int | None) -> int:
     """The number ``threads``; None: the environment variable ``ETHBRAKE_THREADS``, or 1.
 
-    Raises ``InvalidInput`` unless it is a whole number of at least 1.
+    Raises ``InvalidInput`` unless it is a whole number from 1 to 1024.
     """
     if threads is None:
         text = os.environ.get(VARIABLE, "1")
-        if not (text.isascii() and text.isdecimal() and int(text) > 0):
-            raise InvalidInput(f"{VARIABLE} = {text!r}: must be a whole number, at least 1")
+        if not (text.isascii() and text.isdecimal() and len(text) < 5 and 1 <= int(text) <= MOST_THREADS):
+            raise InvalidInput(f"{VARIABLE} = {text!r:.60}: must be a whole number from 1 to {MOST_THREADS}")
         return int(text)
-    check_whole_number("threads", threads, 1)
+    check_whole_number("threads", threads, 1, MOST_THREADS)
     return int(threads)
 
 

@@ -176,16 +176,15 @@ def replaced(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 def outside(game: Game, alert: State, last: State) -> MeasureValue:
-    """Share of a trained policy's decisions outside the range of what it observed in training; for several learners,
-    their mean. Defined if every learner has such a policy.
+    """Share of a trained policy's decisions outside the range of what it observed in training; for several learners
+    with such policies, their mean.
     """
     shield: Any = last.memories.get("shield")
     memories: Any = [last.memories.get(body) for body in game.settings.learners.tolist()]
     if shield is not None:
         memories = getattr(shield, "agents", [getattr(shield, "agent", None)])
-    if not memories or not all(hasattr(memory, "outside") for memory in memories):
-        return None
-    return np.asarray(np.mean([memory.outside for memory in memories], axis=0) / np.maximum(last.steps, 1))
+    outside = [memory.outside for memory in memories if hasattr(memory, "outside")]
+    return np.asarray(np.mean(outside, axis=0) / np.maximum(last.steps, 1)) if outside else None
 
 
 def _built_in(of: Callable[[Game, State, State], MeasureValue], unit: str, *statistics: Statistic) -> Measure:

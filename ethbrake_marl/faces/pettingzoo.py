@@ -201,31 +201,6 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 parallel_env = EthBrakeParallelEnv
 
 
-class Turns(parallel_to_aec_wrapper):  # type: ignore[misc]
-    """PettingZoo's conversion into turns, without its copies: all agents end together, and a step's results are new."""
-
-    agents: list[str]
-    agent_selection: str
-    terminations: dict[str, bool]
-    truncations: dict[str, bool]
-
-    def step(self, action: Any) -> None:
-        """Take the turn of the selected agent. The last turn of a round moves all vehicles."""
-        agent = self.agent_selection
-        if agent != self.agents[-1] or self.terminations[agent] or self.truncations[agent]:
-            super().step(action)
-            return
-        self._actions[agent] = action
-        answer = self.env.step(self._actions)
-        self._observations, self.rewards, self.terminations, self.truncations, self.infos = answer
-        self._cumulative_rewards = dict(self.rewards)
-        if self.env.agents:
-            self.agent_selection = self._agent_selector.reset()
-        else:
-            self.agents = sorted(self.agents)
-            self._deads_step_first()
-
-
 class OrderedTurns(OrderEnforcingWrapper):  # type: ignore[misc]
     """PettingZoo's check of the order of calls, with a ``last`` that looks up fewer attributes."""
 
@@ -248,7 +223,7 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> Any:
     'vehicle_1'
 
     """
-    return OrderedTurns(Turns(parallel_env(scenario, **settings)))
+    return OrderedTurns(parallel_to_aec_wrapper(parallel_env(scenario, **settings)))
 
 
 env = raw_env

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.episode.state import PHYSICS_MARK, State
 from ethbrake_marl.episode.step import StepSettings, at_alert, first_decision
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.motion import layout
 from ethbrake_marl.motion.layout import BRAKE_RATE, FAR_M, GAP, IMPACTS, LATENCY, Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import PER_LINK
@@ -67,7 +67,7 @@ class WorldPool:
         self.scenario, self.purpose = scenario, purpose
         self.stored: tuple[int, int, Any] = -1, 0, None  # seed, number of the first world, worlds
         self.following = -1, -1  # seed and number of the world after those of the last call
-        self.most = WORLDS_AT_ONCE  # calls for fewer worlds may draw many at a time
+        self.most = WORLDS_AT_ONCE // 4  # calls for fewer worlds may draw many at a time
 
     def __reduce__(self) -> tuple[Any, ...]:
         return WorldPool, (self.scenario, self.purpose)  # without the worlds
@@ -78,9 +78,9 @@ class WorldPool:
         worlds = self._stored_worlds(n, seed, first)
         if worlds is None and follows and n < self.most:
             try:
-                many = draw_worlds(self.scenario, max(4 * n, WORLDS_AT_ONCE), seed, first, self.purpose)
+                many = draw_worlds(self.scenario, WORLDS_AT_ONCE, seed, first, self.purpose)
                 self.stored = seed, first, many.worlds
-            except InvalidInput:  # of a world that nobody has asked for yet
+            except EthBrakeError:  # of a world that nobody has asked for yet
                 self.most = 0
             worlds = self._stored_worlds(n, seed, first)
         return draw_worlds(self.scenario, n, seed, first, self.purpose).worlds if worlds is None else worlds

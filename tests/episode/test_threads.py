@@ -107,11 +107,11 @@ def test_threads__are_those_of_the_argument_or_of_the_variable(monkeypatch: pyte
 @pytest.mark.parametrize("text", ["", "0", "-1", "two", "1.5"])
 def test_threads__refuses_a_bad_variable(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ETHBRAKE_THREADS", text)
-    with pytest.raises(InvalidInput, match=rf"^ETHBRAKE_THREADS = '{text}': must be a whole number, at least 1$"):
+    with pytest.raises(InvalidInput, match=rf"^ETHBRAKE_THREADS = '{text}': must be a whole number from 1 to 1024$"):
         game_with(None)
 
 
 @pytest.mark.parametrize("count", [0, -1, 1.5, True, "2"])
 def test_threads__refuses_a_bad_number(count: Any) -> None:
-    with pytest.raises(InvalidInput, match=r"^threads = .*: must be a whole number, at least 1$"):
+    with pytest.raises(InvalidInput, match=r"^threads = .*: must be a whole number in 1..1024$"):
         game_with(count)

@@ -364,9 +364,12 @@ def test_files_of_tests__call_no_kernel_when_they_are_collected() -> None:
 def test_processes_of_xdist__compile_a_kernel_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "kernels.py").write_text(KERNELS.format(factor=2.0))
     monkeypatch.setenv("PYTEST_XDIST_WORKER", "gw0")
-    begun = [begin(tmp_path, tmp_path / "cache", before="import tests.fixtures.kernels\n") for _ in range(4)]
-    said = sorted(process.communicate()[0].split() for process in begun)
-    assert said == [*[["42.0"]] * 3, ["compiles", "True", "42.0"]]
+    counted = (
+        "import atexit, tests.fixtures.kernels\natexit.register(lambda: print(kernels.answer.stats.cache_misses))\n"
+    )
+    begun = [begin(tmp_path, tmp_path / "cache", before=counted) for _ in range(4)]
+    compiled = [process.communicate()[0].startswith("42.0\nCounter({(") for process in begun]
+    assert sorted(compiled) == [False, False, False, True]
 
 
 def test_ctrl_c_while_llvm_calls_python__is_no_lost_exception() -> None:

@@ -19,7 +19,6 @@ from ethbrake_marl.extensions.proofs.chains import (
     HARD_2,
     LATE,
     MOST_PUSH,
-    PRICE,
     PUSH,
     SINCE,
     SOFT,
@@ -27,6 +26,7 @@ from ethbrake_marl.extensions.proofs.chains import (
     UNTIL,
     bounce_of,
     chain_cost,
+    most_push,
 )
 from ethbrake_marl.extensions.proofs.first_contacts import GRAZE_S, last_meeting, outer_contact, rear_times
 from ethbrake_marl.extensions.proofs.line import (
@@ -104,7 +104,7 @@ def first_boxes(kind, at, first, last, gentle, best, until_end, boxes, box):
             box[HARD] = TOUCH_MPS
         else:
             box[SOFT] = max(box[SOFT], TOUCH_MPS)
-        box[PUSH], box[MOST_PUSH], box[SOFT_2], box[HARD_2] = 0.0, best / PRICE, 0.0, fastest
+        box[PUSH], box[MOST_PUSH], box[SOFT_2], box[HARD_2] = 0.0, most_push(at, k % 2 == 0, best), 0.0, fastest
         box[SINCE], box[UNTIL] = (first, rest_of_rear(at)) if k % 4 < 2 else (math.inf, math.inf)
         count = put_box(kind, at, until_end, box, boxes, count)
     return count

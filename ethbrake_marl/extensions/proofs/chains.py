@@ -65,6 +65,16 @@ def price_of(at, push, closing):
 
 
 @kernel
+def most_push(at, touch, cost):
+    """Largest push (m/s) after a first contact, or after a ``touch``, whose price is at most ``cost`` (m2/s2)."""
+    if not touch:
+        return cost / PRICE
+    best = 0.5 * PRICE * (1.0 + at[BOUNCE])
+    impact = min(math.sqrt(cost), best)
+    return (1.0 + at[BOUNCE]) * impact + (cost - impact * impact) / PRICE
+
+
+@kernel
 def bounce_of(at, closing):
     """Restitution of an impact of at least ``closing`` (m/s). ``at``: one world (columns: ``proofs/line.py``)."""
     return at[BOUNCE] if closing >= PLASTIC_MPS else 0.0
@@ -79,10 +89,13 @@ def slowing(share, bounce, soft, hard):
 
 @kernel
 def third_cost(at, closing, thrown):
-    """Cost (m2/s2) of a third contact with this ``closing`` speed of which the second one caused ``thrown`` (m/s)."""
+    """Cost (m2/s2) of a third contact with this ``closing`` speed of which the second one caused ``thrown`` (m/s).
+
+    A touch pushes for nothing.
+    """
     if closing <= TOUCH_MPS:
         return 0.0
-    return closing * closing + PRICE * (1.0 + bounce_of(at, closing)) * max(closing - thrown, 0.0)
+    return closing * closing + PRICE * (1.0 + bounce_of(at, closing)) * max(closing - thrown - TOUCH_MPS, 0.0)
 
 
 @kernel
@@ -112,12 +125,16 @@ def cruise(start, end, duration, first, second, room):
 
 
 @kernel
-def drive_to_rear(at, start, end, duration, room):
+def drive_to_rear(at, start, most, end, duration, room):
     """Least speed (m/s) that the controlled vehicle gains by driving on a way of at most ``room`` (m).
 
-    Other arguments: as for ``cruise``. Infinite: the way is longer. ``at``: one world (columns: ``proofs/line.py``).
+    It begins with a speed from ``start`` to ``most``. A larger one makes the way longer, but less speed is gained where
+    the way is long enough. Other arguments: as for ``cruise``. Infinite: the way is longer. ``at``: one world (columns:
+    ``proofs/line.py``).
     """
     slow = cruise(max(start, 0.0), max(end, 0.0), duration, at[A_F], at[U_F], room)
+    if slow >= min(start, end):
+        slow = max(slow, most)
     return max(end - slow, 0.0) if slow >= 0.0 else math.inf
 
 
@@ -167,14 +184,15 @@ def front_chains(at, box, until_end):
     start = v_l + (1.0 - nu * (1.0 + bounce)) * soft - nu * push - OUTWARD
     room = way_r - at[GAP_R] - place + NEAR_M
     room += (late - early) * max((1.0 - nu) * hard - nu * box[PUSH], 0.0)
-    driven = drive_to_rear(at, start, v_r - box[HARD_2], duration, room)
+    most = v_l + slowing(nu, bounce, soft, hard) - nu * box[PUSH] + OUTWARD
+    driven = drive_to_rear(at, start, most, v_r - box[HARD_2], duration, room)
     if driven == math.inf:
         return math.inf
     high = box[HARD_2]
-    if drive_to_rear(at, start, v_r - box[SOFT_2], duration, room) == math.inf:
+    if drive_to_rear(at, start, most, v_r - box[SOFT_2], duration, room) == math.inf:
         for _ in range(TIGHTENINGS):
             middle = 0.5 * (box[SOFT_2] + high)
-            if drive_to_rear(at, start, v_r - middle, duration, room) == math.inf:
+            if drive_to_rear(at, start, most, v_r - middle, duration, room) == math.inf:
                 box[SOFT_2] = middle
             else:
                 high = middle
@@ -247,7 +265,7 @@ def rear_chains(at, box, until_end):
     place = way - at[GAP_R] - OUTWARD
     kick = (1.0 - mu) * (1.0 + bounce) * hard
     v_late, way_late = follower(at, late)
-    driven = drive_to_rear(at, at[V_F], v_late - hard - OUTWARD, late, way_late - at[GAP_R] + NEAR_M)
+    driven = drive_to_rear(at, at[V_F], at[V_F], v_late - hard - OUTWARD, late, way_late - at[GAP_R] + NEAR_M)
     cost = soft * soft + price_of(at, box[PUSH], hard) + PRICE * driven
     ending = min(until, rest_of_rear(at))
     push = box[MOST_PUSH] + TOUCHES * TOUCH_MPS * ((ending - early) / at[TIME_STEP] + 2.0)

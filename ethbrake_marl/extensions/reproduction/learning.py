@@ -27,7 +27,6 @@ from ethbrake_marl.motion.layout import Floats
 
 RANDOM, HIGH, LOW, STOPPED, DENSE = "random", "high", "low", "stopped", "dense"
 STATUS = "run.json"  # file with the status of a run
-SECONDS = "cpu_s.txt"  # file with the processor time of a finished training
 
 
 class TrainingPlan(NamedTuple):
@@ -107,10 +106,7 @@ def _train(plan: TrainingPlan, run: Path, seed: int, settings: ReproductionSetti
             reward["terminal"] = plan.terminal
         recipe = recipe.replace(reward=reward)
         result = eb.train(recipe, scenario, run, seed=seed, steps=plan.decisions, on_progress=settings.tell)
-    finished = result.status == "finished"
-    if finished:
-        (run / SECONDS).write_text(f"{result.evaluations[-1]['cpu_s']:.1f}\n")
-    return finished
+    return result.status == "finished"
 
 
 def unconverged_policy(folder: Path) -> str:
@@ -227,7 +223,7 @@ def column(run: Path, name: str) -> dict[float, float]:
 def course_of(runs: Sequence[Path]) -> Course:
     returns, harm = ([column(run, name) for run in runs] for name in (RETURN, HARM))
     shared = set.intersection(*map(set, returns))
-    last, seconds = max(harm[0]), [float((run / SECONDS).read_text()) for run in runs]
+    last, seconds = max(harm[0]), [read_object(run / STATUS)["evaluations"][-1]["cpu_s"] for run in runs]
     returns, harm = (
         [{100.0 * k / last: curve[k] for k in sorted(steps)} for curve in curves]
         for curves, steps in ((returns, shared), (harm, harm[0]))

@@ -1,5 +1,6 @@
 """Learning curves and trainings: measures by hand, planted runs, tiny trainings by the paper's process."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,8 +106,7 @@ def test_reward__with_and_without_its_terminal_part() -> None:
 def plant(run: Path, end: float, status: str = "finished") -> None:
     """A run whose harm falls to ``end``; its table has the return in every row, and the harm in some."""
     run.mkdir(parents=True)
-    (run / "run.json").write_text(f'{{"status": "{status}"}}')
-    (run / learning.SECONDS).write_text(f"{end}\n")
+    (run / "run.json").write_text(json.dumps({"status": status, "evaluations": [{"cpu_s": end}]}))
     rows = [f"{500 * k},{-9.0 + k},{'' if k % 2 else end + 4.0 - k}" for k in range(1, 5)]
     (run / "progress.csv").write_text("\n".join([f"steps,{learning.RETURN},{learning.HARM}", *rows]))
 
@@ -186,7 +186,7 @@ def test_process__is_trained_once_in_the_papers_map_and_shown(tiny: Reproduction
     assert process_sheet(tiny, STATED, 20) == []
     assert learning.train_groups(tiny, [RANDOM])
     seeds = learning.finished_runs(tiny.folder, RANDOM)["ppo-paper"]
-    assert all(float((run / learning.SECONDS).read_text()) > 0.0 for run in seeds)
+    assert learning.course_of(seeds).seconds > 0.0
     before = [(run / "run.json").stat().st_mtime_ns for run in seeds]
     assert learning.train_groups(tiny, [RANDOM]) and before == [(run / "run.json").stat().st_mtime_ns for run in seeds]
     mapped = eb.load_scenario("paper-random").replace(physics="paper-map")
