@@ -12,7 +12,7 @@ from typing import Literal
 
 from ethbrake_marl.errors import one_line
 
-LEAST_SHARE = 0.03  # of the work, after which the time left is estimated
+LEAST_SHARE = 0.03  # share of the work that must be done before the time left is estimated
 EVERY_S = 10.0  # time between two lines of progress (s) if stderr is not a terminal
 
 

@@ -23,7 +23,7 @@ DOORS = {
 USUAL = eb.View().features
 TEXT = """# The environment: {gymnasium}
 
-Which numbers go in, and which come out? This page is made from the code by `python -m
+What an agent sends and receives. This page is made from the code by `python -m
 tests.docs.card`. How to use the environment: [environments](../environments.md).
 
 | | |
