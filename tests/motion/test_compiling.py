@@ -82,7 +82,7 @@ def test_processes__begin_at_once_with_an_empty_cache(tmp_path: Path) -> None:
     begun = [begin(tmp_path, tmp_path / "cache") for _ in range(8)]
     ended = [process.communicate() for process in begun]
     assert [said for said, _ in ended] == ["42.0\n"] * 8
-    assert {notice.partition(" for ")[0] for _, notice in ended if notice} == {"compiling the physics"}
+    assert {notice.partition(" ")[0] for _, notice in ended if notice} == {"compiling"}  # all, or what others left
     assert begin(tmp_path, tmp_path / "cache").communicate() == ("42.0\n", "")
     assert {path.suffix for path in (tmp_path / "cache/ethbrake_marl").iterdir()} == {kernel_store.SUFFIX}
 
