@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 
 from ethbrake_marl.episode.counts import COLUMN, IN_WORDS
 from ethbrake_marl.errors import count_of
@@ -25,7 +24,6 @@ from ethbrake_marl.extensions.report.style import (
     finish,
     in_our_style,
     new_panels,
-    plain_number,
     series_style,
     write_picture,
 )
@@ -35,9 +33,9 @@ from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Floats
 
 HARM_TOLERANCE = 1e-6  # m2/s2; a vehicle counts as worse off if its harm rises by more than this
-LINEAR = 0.1  # m2/s2; axes are linear below this harm and logarithmic above it, because harm varies by a factor of 100
 LEVEL_IN, NARROWEST_IN, WIDEST_IN = 1.05, 5.0, 10.5  # width of a level, and of the figure
-PANEL_IN = 2.8  # height of a panel
+PANEL_IN = 3.2  # height of a panel
+MOST_SHOWN = 1.6  # end of the axis, as a multiple of the median of full braking
 
 Json = dict[str, Any]
 
@@ -272,54 +270,45 @@ def share(heading: str) -> Column:
 
 @in_our_style
 def ablation_figure(results: Json, caption: str) -> Figure:
-    """Draw both harms and the honest cost at each level or swept value, with 95 % intervals and a dot for each seed.
+    """Bars of the minimised harm or cost at each level or swept value, with 95 % intervals.
 
-    All means are over the worlds in which the joint optimum is known.
+    A panel for each count that a recipe minimises, with the means above the bars; a bar far above full braking at most
+    levels is cut. All means are over the worlds in which the joint optimum is known.
     """
-    levels, swept = results["levels"], results["settings"]["swept"]
+    levels, recipes = results["levels"], results["settings"]["recipes"]
     names = list(dict.fromkeys(level["level"] for level in levels))
     at = {level["level"]: level.get("swept_number", names.index(level["level"])) for level in levels}
     unit = (max(at.values()) - min(at.values())) / (len(at) - 1)  # mean distance between neighbours
     width = min(max(LEVEL_IN * len(at), NARROWEST_IN), WIDEST_IN)
-    figure, panels = new_panels((width, PANEL_IN * len(COLUMN)), rows=len(COLUMN))
-    for axes, count in zip(panels, COLUMN, strict=True):
-        points = [(at[level["level"]], level["algorithm"], level[count]["searched"]) for level in levels]
-        _draw_bounds(axes, points, 0.3 * unit)
-        for number, algorithm in enumerate(results["settings"]["recipes"]):
-            algorithm_points = [
-                (x + 0.06 * unit * number, entry) for x, name, entry in points if name in (None, algorithm)
-            ]
-            _draw_algorithm(axes, algorithm_points, unit, algorithm, series_style(1 if number == 0 else number + 3))
-        if swept is None:
+    counts = [count for count in COLUMN if count in {recipe["reward"]["harm_count"] for recipe in recipes.values()}]
+    figure, panels = new_panels((width, PANEL_IN * len(counts)), rows=len(counts))
+    bar = 0.7 * unit / len(recipes)
+    for axes, count in zip(panels, counts, strict=True):
+        for number, algorithm in enumerate(recipes):
+            shown = [level for level in levels if level["algorithm"] in (None, algorithm)]
+            harms = [Estimate(**level[count]["searched"]["harm"]) for level in shown]
+            ends = list(zip(*((h.value - h.ends[0], h.ends[1] - h.value) for h in harms), strict=True))
+            places = [at[level["level"]] + bar * (number - (len(recipes) - 1) / 2) for level in shown]
+            colour = series_style(1 if number == 0 else number + 3)["color"]
+            axes.bar(places, [h.value for h in harms], bar, yerr=ends, capsize=3, label=algorithm, color=colour)
+            for place, harm in zip(places, harms, strict=True):
+                axes.text(place, 0.94, f"{harm.value:.2f}", transform=axes.get_xaxis_transform(), ha="center", fontsize=8)
+        _draw_bounds(axes, [(at[level["level"]], level[count]["searched"]) for level in levels], 0.42 * unit)
+        if results["settings"]["swept"] is None:
             words = [name.removeprefix("cooperation-").removeprefix("level-").replace("-", "\n", 1) for name in names]
             axes.set_xticks([at[name] for name in names], words, fontsize=8)
-        if axes.dataLim.ymin < 1.0:
-            axes.set_yscale("symlog", linthresh=LINEAR)
-        axes.yaxis.set_major_formatter(FuncFormatter(plain_number))
-        axes.set_ylim(0.0, (1.5 if axes.get_yscale() == "symlog" else 1.1) * axes.get_ylim()[1])
-        axes.set(title=TITLES[count], xlabel=swept or "")
-    return finish(figure, " ".join([*results["undertrained"], caption]), panels[0], columns=2, fontsize=8.5)
+        braking = [level[count]["searched"]["full_brake"]["value"] for level in levels]
+        axes.set_ylim(0.0, min(1.1 * axes.get_ylim()[1], MOST_SHOWN * float(np.median(braking))))
+        axes.set(title=TITLES[count], xlabel=results["settings"]["swept"] or "")
+    return finish(figure, " ".join([*results["undertrained"], caption]), panels[0], columns=3, fontsize=8.5)
 
 
-def _draw_bounds(axes: Axes, points: list[tuple[float, str | None, Json]], half: float) -> None:
+def _draw_bounds(axes: Axes, points: list[tuple[float, Json]], half: float) -> None:
     for key, label, colour in (
         ("full_brake", "full braking", GREY),
         ("best_known", "joint optimum", series_style(3)["color"]),
     ):
-        known_points = [(x, entry[key]["value"]) for x, _, entry in points if entry[key] is not None]
+        known_points = [(x, entry[key]["value"]) for x, entry in points if entry[key] is not None]
         for number, (x, value) in enumerate(known_points):
             name = "" if number else label
             axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=name)
-
-
-def _draw_algorithm(
-    axes: Axes, points: list[tuple[float, Json]], unit: float, algorithm: str, style: dict[str, Any]
-) -> None:
-    harms = [Estimate(**entry["harm"]) for _, entry in points]
-    errors = list(zip(*((h.value - h.ends[0], h.ends[1] - h.value) for h in harms), strict=True))
-    look = style | {"linestyle": "none"}
-    axes.errorbar([x for x, _ in points], [h.value for h in harms], yerr=errors, capsize=3, label=algorithm, **look)
-    for x, entry in points:
-        dots = entry["each_seed"]
-        if len(dots) > 1:
-            axes.scatter([x + 0.05 * unit] * len(dots), dots, s=6, color=style["color"], alpha=0.5, linewidths=0)
