@@ -18,7 +18,7 @@ from ethbrake_marl.extensions.reproduction.verdicts import Verdict, paper_texts
 from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.site import DOCS, load
 
-PAGE = (DOCS / "extensions" / "reproduction.md").read_text("utf-8")
+PAGE = (DOCS / "paper.md").read_text("utf-8")
 RESULTS = (DOCS / "results" / "reproduction" / "README.md").read_text("utf-8")
 
 sampling = load("../studies/sampling")
