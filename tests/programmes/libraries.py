@@ -297,10 +297,7 @@ def cases(given: Given) -> Cases:
         if way.library in taken:
             yield f"{way.library}: {way.title} ({way.ran})", partial(run, way.library, f"tell({k})", given)
     if "BenchMARL" in taken:
-        yield (
-            "BenchMARL: docs/train.md, docs/libraries.md",
-            partial(run, "BenchMARL", "tell_programs()", given),
-        )
+        yield ("BenchMARL: docs/train.md, docs/libraries.md", partial(run, "BenchMARL", "tell_programs()", given))
 
 
 def run(library: str, function: str, given: Given) -> Told:
