@@ -76,7 +76,7 @@ html_show_sourcelink = False
 copybutton_prompt_text = "$ "
 copybutton_only_copy_prompt_lines = True
 
-# Pages that the site makes from other files: README, cards of policies, help texts.
+# Pages that the site makes from other files: README, cards of policies, help texts, tables of the reproduction.
 
 LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
@@ -134,6 +134,13 @@ def cards() -> str:
     return "\n\n".join(re.sub(r"(?m)^#(?=#* )", "##", text) for text in texts)
 
 
+def reproduction() -> str:
+    """Main tables of the paper's reproduction, from its CSV files."""
+    files = ("claims.csv", "changes/claims-and-changes.csv", "gaps/register-of-what-the-paper-leaves-open.csv")
+    blocks = (f"```{{csv-table}}\n:file: results/reproduction/{file}\n:header-rows: 1\n```" for file in files)
+    return "## Tables\n\n" + "\n\n".join(blocks)
+
+
 def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Complete the pages that are made, and lead links that leave docs/ to their page on the site."""
     text = relink(source[0], docname, (DOCS / docname).parent)
@@ -141,6 +148,8 @@ def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
         text = first_page()
     elif docname == "reference/cli":
         text += "\n" + commands()
+    elif docname == "paper":
+        text += "\n" + reproduction()
     elif docname == "reference/policies":
         text += "\n" + cards()
     source[0] = text
