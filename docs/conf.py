@@ -30,7 +30,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinxcontrib.autodoc_pydantic",
 ]
-exclude_patterns = ["_build", "**.ipynb_checkpoints", "README.md", "templates"]
+exclude_patterns = ["_build", "**.ipynb_checkpoints", "templates"]
 templates_path = ["templates"]
 highlight_language = "none"
 
@@ -76,7 +76,7 @@ html_show_sourcelink = False
 copybutton_prompt_text = "$ "
 copybutton_only_copy_prompt_lines = True
 
-# Pages that the site makes from other files: README, cards of policies, help texts.
+# Pages that the site makes from other files: README, cards of policies, help texts, tables of the reproduction.
 
 LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
@@ -90,25 +90,23 @@ def relink(text: str, docname: str, folder: Path) -> str:
             return found[0]
         if path.name == "card.md":
             path, anchor = DOCS / "reference" / "policies.md", f"#{path.parent.name}"
-        pages = {ROOT / "README.md": "index.md", DOCS / "README.md": "index.md", ROOT / "CHANGELOG.md": "changelog.md"}
+        pages = {ROOT / "README.md": "index.md", ROOT / "CHANGELOG.md": "changelog.md"}
         return f"]({os.path.relpath(DOCS / pages.get(path, path), (DOCS / docname).parent)}{anchor})"
 
     return LINK.sub(lead, text)
 
 
-def navigation(pages: Iterable[str], caption: str = "") -> str:
+def navigation(pages: Iterable[str], caption: str) -> str:
     """Hidden table of contents."""
-    options = ":hidden:\n" + (f":caption: {caption}\n" if caption else "")
-    return f"\n\n```{{toctree}}\n{options}\n" + "\n".join(dict.fromkeys(pages)) + "\n```\n"
+    return f"\n\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n" + "\n".join(pages) + "\n```\n"
 
 
 def first_page() -> str:
-    """README, with the sections of docs/README.md as the site's navigation."""
+    """README, with the sections of docs/index.md as the site's navigation."""
     text = relink((ROOT / "README.md").read_text("utf-8"), "index", ROOT)
-    for section in relink((DOCS / "README.md").read_text("utf-8"), "index", DOCS).split("\n## ")[1:]:
+    for section in relink((DOCS / "index.md").read_text("utf-8"), "index", DOCS).split("\n## ")[1:]:
         caption, _, listed = section.partition("\n")
-        pages = re.findall(r"(?m)^- \[[^\]]*\]\(([^)\s]+)\)", listed)  # the first link of each entry
-        text += navigation([page for page in pages if page != "index.md"], caption)
+        text += navigation(re.findall(r"(?m)^- \[[^\]]*\]\(([^)\s]+)\)", listed), caption)
     return text
 
 
@@ -136,6 +134,13 @@ def cards() -> str:
     return "\n\n".join(re.sub(r"(?m)^#(?=#* )", "##", text) for text in texts)
 
 
+def reproduction() -> str:
+    """Main tables of the paper's reproduction, from its CSV files."""
+    files = ("claims.csv", "changes/claims-and-changes.csv", "gaps/register-of-what-the-paper-leaves-open.csv")
+    blocks = (f"```{{csv-table}}\n:file: results/reproduction/{file}\n:header-rows: 1\n```" for file in files)
+    return "## Tables\n\n" + "\n\n".join(blocks)
+
+
 def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Complete the pages that are made, and lead links that leave docs/ to their page on the site."""
     text = relink(source[0], docname, (DOCS / docname).parent)
@@ -143,10 +148,10 @@ def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
         text = first_page()
     elif docname == "reference/cli":
         text += "\n" + commands()
+    elif docname == "paper":
+        text += "\n" + reproduction()
     elif docname == "reference/policies":
         text += "\n" + cards()
-    elif docname.endswith("/README"):
-        text += navigation(path for path, _ in LINK.findall(source[0]) if path.endswith(".md") and path[0] != ".")
     source[0] = text
 
 

@@ -1,4 +1,4 @@
-"""The drawings of docs/internals/model.md, from the engine: ``python docs/drawings.py`` writes them to docs/figures."""
+"""The drawings of docs/physics.md, from the engine: ``python docs/drawings.py`` writes them to docs/figures."""
 
 from __future__ import annotations
 

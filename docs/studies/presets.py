@@ -1,4 +1,4 @@
-"""Delays of the news with each preset, for docs/results/cooperation.md.
+"""Delays of the news with each preset, for docs/cooperation.md.
 
 .venv/bin/python docs/studies/presets.py
 """

@@ -1,4 +1,4 @@
-"""The price of not knowing: the tables of docs/results/baselines.md and the figure of docs/cooperation.md.
+"""The price of not knowing: table and figure of docs/cooperation.md.
 
     .venv/bin/python docs/studies/price.py docs/figures/price-of-not-knowing.png
 

@@ -1,4 +1,4 @@
-"""One pair of vehicles in each regime of the closed form: figure of docs/internals/proofs/constant-deceleration.md.
+"""One pair of vehicles in each regime of the closed form: figure of docs/proofs/constant-deceleration.md.
 
 .venv/bin/python docs/studies/regimes.py docs/figures/regimes.png
 """

@@ -1,4 +1,4 @@
-"""How the paper's fixed-step map converges to the exact harm with smaller steps: docs/extensions/reproduction.md.
+"""How the paper's fixed-step map converges to the exact harm with smaller steps: docs/paper.md.
 
     .venv/bin/python docs/studies/sampling.py docs/figures/sampled-convergence.png
 

@@ -1,4 +1,4 @@
-"""Harm that no bound of a shield covers, for docs/results/shield.md: between the corners, and after the horizon.
+"""Harm that no bound of a shield covers, for docs/shield.md: between the corners, and after the horizon.
 
 python docs/studies/uncovered.py --intervals mass_t=20% --draws 10000
 python docs/studies/uncovered.py --horizon

@@ -7,7 +7,7 @@ pair in front and the pair behind are independent. The harm predicted for a dece
     H(a) = c_front(a)^2 + c_rear(a)^2    (m2/s2)
 
 with the closing speeds c at the first impacts. Between a few decelerations, the candidates, H is concave, so its
-minimum is at one of them. docs/internals/proofs/constant-deceleration.md derives every line.
+minimum is at one of them. docs/proofs/constant-deceleration.md derives every line.
 """
 
 from __future__ import annotations

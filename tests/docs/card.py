@@ -128,7 +128,7 @@ def more_features() -> list[list[str]]:
     for name in GROUPS:
         count = len(eb.View([name]).features)
         forecast = "the braking of least forecast cost, and what follows" if name == "plan" else "the next impacts"
-        meaning = f"[forecasts](../extensions/learners.md#forecasts): {forecast}"
+        meaning = f"[forecasts](../train.md#forecasts): {forecast}"
         rows.append([f"`{name}`", f"{count} {meaning}", "", "", "", ""])
     return rows
 

@@ -1,4 +1,4 @@
-"""``docs/internals/layout.md``: ``python -m tests.docs.layout`` makes it from the package, a test compares it."""
+"""The end of ``docs/code.md``: ``python -m tests.docs.layout`` makes it from the package, a test compares it."""
 
 import argparse
 import ast
@@ -8,54 +8,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "ethbrake_marl"
-PAGE = ROOT / "docs" / "internals" / "layout.md"
-BEGINNING = """# How the code is laid out
-
-Which file does what? [Another page](reading.md) says in which order to read the core.
+PAGE = ROOT / "docs" / "code.md"
+BEGINNING = """## Every folder
 
 The core has everything that the paper's environment, training, scenarios and levels of cooperation
-need. An extension is a folder whose table `parts.py` says what it adds; [no module of the core names
-it](../decisions/README.md#the-core-never-names-an-extension). To delete one, delete its folder, its
-folder in `tests/extensions/`, and every extension that uses it.
-
-A module imports only from its own folder or from what this page lists below it; `make lint` checks
-this. `python -m tests.docs.layout` makes this page from the code.
-
-## Where to look
-
-| question | file |
-|---|---|
-| How does one step of an episode go? | `episode/game.py`, `Game.step`; `episode/step.py`; [the game](../game.md) |
-| What does one impact cost? | `motion/impact.py`; who bears it: `state.py`, `split_harm`; in infos: `infos.py` |
-| How does a scenario become a game? | `worlds/`: `catalogue.py`, `game.py`; worlds are drawn in `sampling.py` |
-| How do environments play it? | `faces/face.py`, on `faces/stream.py`: its episodes, drawn again when they end |
-| What would happen? | `episode/play.py`: `price` (a plan); `episode/hold.py`: `hold` (constant commands) |
-| Where does a number in a table come from? | `evaluation/`: `measures.py`, `statistics.py`, `summary.py` |
-| Why did the shield replace an action? | `shields/step.py`: the proof, then the code; codes in `shields/shield.py` |
-| What is a reward term? | `episode/terms.py` (formulas), `episode/reward.py` (weights, named rewards) |
-| Which agents are there? | `parts.py`, `agents/`; what names mean: `names.py`; [add one](../extend.md#an-agent) |
-| Who lets agents drive? | `agents/team.py`: `play`, `play_to_end` |
-| What can a scenario file say? | `worlds/`: `scenario.py`, `quantities.py`; [scenarios](../scenarios.md) |
-| How does a training run? | `training/`: `train.py`, `ppo.py`, `sac.py`; between two updates: `updates.py` |
-| How do I add a column to an evaluation? | [a measure](../extend.md#a-measure) |
-
-From a name to a number, as in `ethbrake evaluate --agents universal`:
-
-```text
-cli/evaluate.py         evaluate_command
-names.py                teams_of, make_agent; parts.py says: agents/trained.py, make_trained
-policies/bundle.py      load_shipped
-evaluation/compared.py  Compared.of (in Python one begins with the next line)
-evaluation/door.py      evaluate; worlds/sampling.py, draw_worlds: the fixed list of worlds
-evaluation/evaluate.py  evaluate_teams
-agents/team.py          play, and in each step:
-episode/game.py         Game.step
-episode/step.py         step; script_calls.py, ask_script: agents/policy_agent.py, policies/actor.py
-motion/interval.py      move_line; motion/impact.py, resolve_impacts: the harm
-evaluation/measures.py  harm: episode/state.py, State.harm
-evaluation/summary.py   summarise; statistics.py, mean
-files/sheet.py          Sheet: columns become text
-```
+need. A folder or file imports only from its own folder or from the lines below it; `make lint` checks
+this. `python -m tests.docs.layout` makes this list from the code.
 """
 END = """
 `scenarios/` has one YAML file for each scenario, `train/` one for each recipe; those of an extension
@@ -116,16 +74,17 @@ def page() -> str:
     beside = [" · ".join(layer) for layer in extensions]
     return "\n".join(
         [
-            BEGINNING,
-            "## The core\n",
-            "This list shows the core. A folder or file uses only folders and files in the lines below it:\n",
+            PAGE.read_text("utf-8").partition(BEGINNING.partition("\n")[0])[0] + BEGINNING,
             "```text",
             *drawing,
             "```",
             "",
             *table([layer for layer in core if layer]),
-            "\n## Extensions\n",
-            "An extension may use the core and the extensions in the lines below it:\n",
+            "\n### Extensions\n",
+            "An extension is a folder whose table `parts.py` says what it adds; [no module of the core names",
+            "it](decisions/README.md#the-core-never-names-an-extension). It may use the core and the extensions in",
+            "the lines below it. To delete one, delete its folder, its folder in `tests/extensions/`, and every",
+            "extension that uses it.\n",
             "```text",
             *beside,
             "```",

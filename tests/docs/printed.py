@@ -1,7 +1,7 @@
 """Tables and pictures of the pages, and the commands with which ``make figures`` makes them again.
 
-The beginning of its header identifies a table, the name of its file a picture. A results page names the commands
-itself.
+The beginning of its header identifies a table, the name of its file a picture. A section whose
+table is compared names its commands itself.
 """
 
 import re
@@ -20,7 +20,7 @@ PAGES = [
     *sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts),
     *sorted((ROOT / "ethbrake_marl" / "_policies").glob("*/card.md")),
 ]
-COMPARED = "`make figures` compares"  # in a section of docs/results
+COMPARED = "`make figures` compares the table"  # in a section with the commands
 
 
 @dataclass(frozen=True)
@@ -76,13 +76,13 @@ def pages() -> list[Path]:
 
 
 def tables() -> Iterator[Shown]:
-    """Tables that ``make figures`` compares: those of ``TABLES``, and those of docs/results that say so."""
+    """Tables that ``make figures`` compares: those of ``TABLES``, and those of sections that say so."""
     for page in pages():
         for section in page.read_text("utf-8").split("\n## "):
             commands = tuple(re.findall(r"(?m)^\$ (.*)", section))
             for table in TABLE.findall(BLOCK.sub("", section)):
                 begin = table.partition("\n")[0]
-                if COMPARED in " ".join(section.split()) and page.parent.name == "results":
+                if COMPARED in " ".join(section.split()):
                     yield Shown(_name(page), begin, table, commands)
                 for key, known in TABLES.items():
                     if begin.startswith(key):

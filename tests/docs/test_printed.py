@@ -34,12 +34,12 @@ def test_everything_compared__is_still_on_a_page() -> None:
 def test_table_of_shipped_lists__is_printed_by_its_command(capsys: pytest.CaptureFixture[str]) -> None:
     load("best_harm").main(["--shipped"])
     printed = capsys.readouterr().out.splitlines()
-    for row in rows("results/best-harm", "## Proven and best known harm"):
+    for row in rows("least-harm", "## Proven and best known harm"):
         assert any(one.startswith(f"| {' | '.join(row)}") for one in printed), row
 
 
 def test_reference_values__are_those_of_the_closed_form() -> None:
-    for world, *ends in rows("results/baselines", "## Values of the closed form")[1:]:
+    for world, *ends in rows("proofs/constant-deceleration", "## Checks")[1:]:
         gaps, speeds, latency = ([float(word) for word in part.split(",")] for part in world.split(";"))
         scenario = eb.load_scenario("paper-random").replace(latency_s=[0.0, *latency])
         start = {f"gap_{k}_m": [gap] for k, gap in enumerate(gaps, 1)}

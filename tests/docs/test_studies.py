@@ -24,7 +24,7 @@ drawings = load("../drawings")
 @pytest.mark.usefixtures("pinned_matplotlib")
 @pytest.mark.parametrize("name", drawings.DRAWINGS)
 def test_drawing__is_the_one_that_is_shown(name: str) -> None:
-    assert f"](../figures/model-{name}.svg)" in (DOCS / "internals" / "model.md").read_text("utf-8").replace("\n", " ")
+    assert f"](figures/model-{name}.svg)" in (DOCS / "physics.md").read_text("utf-8").replace("\n", " ")
     made = picture_bytes(drawings.DRAWINGS[name](), "made.svg")
     assert made == (DOCS / "figures" / f"model-{name}.svg").read_bytes()
 
@@ -87,7 +87,7 @@ def test_team_curves__the_table_in_the_docs_is_made_from_the_numbers_beside_the_
     levels, drivers = (list(dict.fromkeys(row[k] for row in rows)) for k in (0, 1))
     harms = {(level, driver): first for level, driver, _, _, first, _ in rows}
     assert (
-        table_of("results/cooperation", "## Five algorithms at 45 processor seconds each")
+        table_of("results/learning", "## Five algorithms at 45 processor seconds each")
         == [
             ["who drives the learners", *levels],  # without baselines, which have other numbers on the evaluation list
             *([driver, *(harms[level, driver] for level in levels)] for driver in drivers[2:]),

@@ -1,6 +1,6 @@
 """On a GPU, in fifteen minutes: all tests of the extension, the bits of a processor, speed and training.
 
-If all is good, it writes the table of docs/extensions/cuda.md. Without a GPU the same code runs on a processor, and
+If all is good, it writes the table of docs/libraries.md. Without a GPU the same code runs on a processor, and
 nothing is written.
 
 A GPU needs torch alone if the folder of the machine code (``NUMBA_CACHE_DIR``) comes from a machine with numba-cuda
@@ -28,7 +28,7 @@ from tests.extensions.cuda.test_worlds import SIX, whole_episodes
 from tests.programmes import ROOT, Cases, Given, Told, watched
 
 LIMIT_S = 900.0  # no case begins later
-PAGE, HEADING = "docs/extensions/cuda.md", "## How fast\n"
+PAGE, HEADING = "docs/libraries.md", "## How fast\n"
 UNTRIED = {  # file -> what it says until this programme has run on a GPU
     "README.md": "; experimental: not run on a GPU since a prototype in November 2026",
     PAGE: "Experimental: not run on a GPU since a prototype in November 2026.\n\n",

@@ -1,6 +1,6 @@
 """Other libraries: every program of libraries.md in this folder runs unchanged, and its policy can be used as an agent.
 
-The programs of docs/train.md and docs/extensions/benchmarl.md run, too, in the environment of BenchMARL. Each library
+The programs of docs/train.md and docs/libraries.md run, too, in the environment of BenchMARL. Each library
 has its own environment in ``.venvs/``; one that cannot be installed is skipped with the reason. A policy is evaluated
 on a fixed list of worlds, together with full braking, and compared, world by world, with the library's own evaluation
 if there is one. docs/results/learning.md has the printed rows that beat full braking. ``--ci`` runs only the libraries
@@ -27,7 +27,7 @@ import numpy as np
 from tests.programmes import KEPT, ROOT, Cases, Given, NotInstalled, Told, ready_python, watched
 
 PAGE = Path(__file__).with_name("libraries.md")
-TRAIN, BENCHMARL = ROOT / "docs" / "train.md", ROOT / "docs" / "extensions" / "benchmarl.md"
+PROGRAMS = {"train.md": "## With a recipe", "libraries.md": "## On a GPU"}  # page of docs -> first heading behind
 SCENARIO, EPISODES, SEED = "paper-random", 500, 7
 OWN_EPISODES, CLOSE = 50, 1e-5  # worlds of the library's own evaluation, and tolerance in m2/s2
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -237,16 +237,16 @@ def tell(k: int) -> None:
 
 
 def harm_of_programs() -> dict[str, dict[str, float]]:
-    """Mean harm of full braking and of each policy of docs/train.md and docs/extensions/benchmarl.md.
+    """Mean harm of full braking and of each policy of docs/train.md and docs/libraries.md.
 
     Without BenchMARL only the programs of docs/train.md run. MAPPO need not beat full braking: the page says that a
     minute is too short.
     """
     names: dict[str, Any] = {"__name__": "copied"}
-    for page in (TRAIN, BENCHMARL) if find_spec("benchmarl") else (TRAIN,):
-        programs = page.read_text("utf-8").partition("\n## With a recipe\n")[0]
+    for page, end in [*PROGRAMS.items()][: 2 if find_spec("benchmarl") else 1]:
+        programs = (ROOT / "docs" / page).read_text("utf-8").partition(f"\n{end}\n")[0]
         for code in re.findall("```python\n(.*?)```", programs, re.DOTALL):
-            exec(compile(code, page.name, "exec"), names)
+            exec(compile(code, page, "exec"), names)
     for trained, harms in names["harm"].items():
         full, theirs = harms.values()
         assert theirs < full or trained == "mappo", f"{trained}: {theirs:.2f} does not beat full braking, {full:.2f}"
@@ -297,10 +297,7 @@ def cases(given: Given) -> Cases:
         if way.library in taken:
             yield f"{way.library}: {way.title} ({way.ran})", partial(run, way.library, f"tell({k})", given)
     if "BenchMARL" in taken:
-        yield (
-            "BenchMARL: docs/train.md, docs/extensions/benchmarl.md",
-            partial(run, "BenchMARL", "tell_programs()", given),
-        )
+        yield ("BenchMARL: docs/train.md, docs/libraries.md", partial(run, "BenchMARL", "tell_programs()", given))
 
 
 def run(library: str, function: str, given: Given) -> Told:

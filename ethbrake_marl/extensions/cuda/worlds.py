@@ -49,7 +49,7 @@ class Worlds:
     """n episodes on one device, with the same bits as ``Game.step``.
 
     An episode that ends is replaced, in the same step, by an episode in the next world of a pool, which is drawn in
-    advance. An example is in docs/extensions/cuda.md.
+    advance. An example is in docs/libraries.md.
     """
 
     def __init__(

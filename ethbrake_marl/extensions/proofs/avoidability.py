@@ -3,7 +3,7 @@
 The *largest trajectory* stays behind the front vehicle, and is farther ahead at every time than any other that does.
 Contact with the rear vehicle can be avoided if and only if the rear vehicle stays behind the largest trajectory.
 
-docs/internals/proofs/avoidable-contact.md derives every formula.
+docs/proofs/harm.md derives every formula.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ REASONS = ("", "early", "front", "rear")
 
 REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, VERDICT = range(7)  # columns of a verdict, and their number
 COVERED_LINES = ((3, 2), (2, 1), (2, 2))  # number of vehicles, body of the controlled vehicle
-PROVEN_FOR = "9c34cfada8195d65"  # digest of the physics; docs/internals/model.md says when to renew it
+PROVEN_FOR = "9c34cfada8195d65"  # digest of the physics; docs/physics.md says when to renew it
 
 
 class Avoidability(NamedTuple):

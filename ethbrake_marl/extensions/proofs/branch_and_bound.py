@@ -4,7 +4,7 @@ A first contact has a time and a closing speed. Its harm is its squared closing 
 (``followers.after``). A *cell* is a set of first contacts: a range of times and a range of closing speeds. The search
 halves the cell with the smallest bound until this bound is close to the smallest harm that it has reached.
 
-Proof: docs/internals/proofs/lower-bound.md. Arguments: ``proofs/__init__.py``.
+Proof: docs/proofs/harm.md. Arguments: ``proofs/__init__.py``.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The search halves the box (file ``chains``) with the smallest bound until it is small, or the memory is full; the bound
 is valid whenever the search ends.
 
-Theorem and proof: docs/internals/proofs/honest-bound.md. Arguments: ``proofs/__init__.py``.
+Theorem and proof: docs/proofs/harm.md. Arguments: ``proofs/__init__.py``.
 """
 
 from __future__ import annotations

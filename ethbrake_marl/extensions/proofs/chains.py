@@ -5,7 +5,7 @@ neighbour, and the next contact with the first neighbour. A *box* is a set of ch
 [BOX_ROWS, BOXES], with the smallest and the largest value of five quantities. Each function bounds the cost of all
 chains of a box.
 
-Theorem and proof: docs/internals/proofs/honest-bound.md. Arguments: ``proofs/__init__.py``.
+Theorem and proof: docs/proofs/harm.md. Arguments: ``proofs/__init__.py``.
 """
 
 from __future__ import annotations

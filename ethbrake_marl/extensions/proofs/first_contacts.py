@@ -1,6 +1,6 @@
 """At which times the first contact of the controlled vehicle can be with each neighbour.
 
-Proof: docs/internals/proofs/lower-bound.md. Arguments: ``proofs/__init__.py``.
+Proof: docs/proofs/harm.md. Arguments: ``proofs/__init__.py``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """An upper bound on the speed of a vehicle relative to the centre of mass of its pair after a first contact.
 
 The *pair* is the controlled vehicle and its *partner*, the neighbour of its first contact. A *flight* is a period in
-which the two are not in contact. Proofs: docs/internals/proofs/lower-bound.md.
+which the two are not in contact. Proofs: docs/proofs/harm.md.
 
 - ``pair``: ``(share, press, reach, bounce)``. ``share``: mass of the partner divided by the mass of the pair, 0 to 1.
   ``press``: acceleration of the two towards each other under the extreme command (m/s2). ``reach``: largest amount by

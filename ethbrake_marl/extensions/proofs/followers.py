@@ -8,7 +8,7 @@ controlled vehicle moves faster or slower than this centre only until it meets t
 Each function computes one bound for all first contacts between the times ``early`` and ``late``, from the state at
 ``early``. From ``late`` to ``end`` the command of the earlier decision still applies.
 
-Proofs: docs/internals/proofs/lower-bound.md. Arguments: ``proofs/__init__.py``.
+Proofs: docs/proofs/harm.md. Arguments: ``proofs/__init__.py``.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """``lower_bound``: a proven lower bound on the harm of every world, whatever the controlled vehicle does.
 
-Proof: docs/internals/proofs/lower-bound.md. Arguments: ``proofs/__init__.py``.
+Proof: docs/proofs/harm.md. Arguments: ``proofs/__init__.py``.
 """
 
 from __future__ import annotations

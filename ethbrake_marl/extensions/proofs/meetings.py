@@ -2,7 +2,7 @@
 
 The front vehicle already brakes; the rear vehicle coasts until its latency has elapsed, then brakes. ``drive`` is the
 time (s) for which a vehicle drives before it brakes, ``brake`` the time for which it brakes before it drives. Times
-count from the moment at which the controlled vehicle may act. Proofs: docs/internals/proofs/lower-bound.md.
+count from the moment at which the controlled vehicle may act. Proofs: docs/proofs/harm.md.
 """
 
 from __future__ import annotations

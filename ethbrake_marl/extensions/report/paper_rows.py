@@ -56,8 +56,8 @@ PAPER_NOTE = (
     " the paper's row (scenario paper-random-early). The paper's harm of E-V2X-BM is close to the harm that the"
     " pairwise closed form predicts, not to the simulated harm. For the table of 5,000 worlds, this is true only at"
     " the speeds of the random test: at the speeds of the paper's figure of distances, the closed form predicts 3.07."
-    " Nothing in this package is tuned to these rows. docs/internals/paper.md compares the paper's equations,"
-    " docs/extensions/reproduction.md its figures and tables."
+    " Nothing in this package is tuned to these rows. docs/paper.md compares the paper's equations,"
+    " and says what could be reproduced."
 )
 
 SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant that PAPER_NOTE mentions

@@ -73,7 +73,7 @@ GAPS = (
     Gap("impacts before Vehicle 2 may act", "sec:system_model: assumed not to happen", "such worlds are drawn again",
         otherwise="no effect: no world of the random test has one"),
     Gap("weights of the reward", "w_h, w_p, w_j, R_safe, k_energy, k_d, d_safe, d_target: none stated",
-        "1, 0.1, 1e-5, 10 in ppo-paper", otherwise="each needs trainings: docs/extensions/reproduction.md has some"),
+        "1, 0.1, 1e-5, 10 in ppo-paper", otherwise="each needs trainings: docs/paper.md has some"),
     Gap("state of the policy", "MDP formulation: positions, speeds, actions of the others",
         "also capacities, masses, latencies, e and derived features",
         otherwise="--full trains ppo-paper and sac-paper, which observe the paper's state"),

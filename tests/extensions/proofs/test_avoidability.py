@@ -216,7 +216,7 @@ def test_proofs__are_for_this_physics():
     assert physics_digest() == PROVEN_FOR, (
         f"the code of motion/ has changed: set PROVEN_FOR (extensions/proofs/avoidability.py) to {physics_digest()!r},"
         " and keep it only if `pytest --all tests/extensions/proofs` and `pytest -m nightly"
-        " tests/motion/test_proofs.py` succeed (docs/internals/model.md)"
+        " tests/motion/test_proofs.py` succeed (docs/physics.md)"
     )
 
 

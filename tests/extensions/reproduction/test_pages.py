@@ -1,5 +1,6 @@
 """The pages about the reproduction: their numbers and claims are those of today's code."""
 
+import csv
 import re
 from typing import get_args
 
@@ -18,8 +19,8 @@ from ethbrake_marl.extensions.reproduction.verdicts import Verdict, paper_texts
 from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.site import DOCS, load
 
-PAGE = (DOCS / "extensions" / "reproduction.md").read_text("utf-8")
-RESULTS = (DOCS / "results" / "reproduction" / "README.md").read_text("utf-8")
+PAGE = (DOCS / "paper.md").read_text("utf-8")
+RESULTS = DOCS / "results" / "reproduction" / "claims.csv"
 
 sampling = load("../studies/sampling")
 
@@ -33,30 +34,28 @@ def test_sampling__prints_the_errors_that_the_page_tells(agent: str) -> None:
     assert picture_bytes(sampling.draw([study]), "study.png").startswith(b"\x89PNG")
 
 
-HEADING = "| Where | The paper | Ours, as stated | Ours, nearest reading | Verdict | Why |"
+HEADING = ["Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Verdict", "Why"]
 SENTENCES = paper_texts()["sentences"]
 
 
-def escaped(text: str) -> str:
-    return text.replace("H*", r"H\*").replace("a*", r"a\*")
-
-
-def sentences_of(page: str) -> list[list[str]]:
-    """The rows of the table of sentences of a page, as texts."""
-    rows = page.split(f"{HEADING}\n")[1].split("\n\n")[0].splitlines()[1:]
-    return [re.split(r" ?(?<!\\)\| ?", row)[1:-1] for row in rows]
+def sentences() -> list[list[str]]:
+    """The committed rows of the table of sentences, as texts."""
+    with RESULTS.open(encoding="utf-8", newline="") as file:
+        heading, *rows = csv.reader(file)
+    assert heading == HEADING
+    return rows
 
 
 def test_results__have_every_sentence_in_the_papers_order() -> None:
-    committed = [row[:2] for row in sentences_of(RESULTS)]
-    assert committed == [[each["where"], escaped(each["paper"])] for each in SENTENCES]
+    committed = [row[:2] for row in sentences()]
+    assert committed == [[each["where"], each["paper"]] for each in SENTENCES]
 
 
 def test_results__have_a_number_in_each_row_that_was_run_and_the_reason_for_its_verdict() -> None:
-    for row, sentence in zip(sentences_of(RESULTS), SENTENCES, strict=True):
+    for row, sentence in zip(sentences(), SENTENCES, strict=True):
         *_, ours, _, verdict, why = row
         assert re.search(r"\d", ours) or verdict == "not run"
-        assert why == escaped(sentence["why"].get(verdict, "").strip())
+        assert why == sentence["why"].get(verdict, "").strip()
         assert why or verdict in ("agrees", "not run")
 
 
@@ -81,13 +80,13 @@ def test_sentences__are_judged_by_claims_that_the_code_makes_and_no_claim_is_lef
 
 
 def test_results__are_those_of_this_version_and_the_non_ethical_row_of_today() -> None:
-    assert f"version {__version__}, physics {physics_digest()})" in " ".join(RESULTS.split())
+    assert f"version {__version__}, physics {physics_digest()})" in " ".join(PAGE.split())
     stated, nearest = ({NON_E: report_outcome(NON_E, reading, PAPER_EPISODES)} for reading in (STATED, NEAREST))
     claims = tables.number_claims(RANDOM_TEST[:1], stated, nearest, 0.0 * stated[NON_E][1])
-    rows = [row[2:5] for row in sentences_of(RESULTS) if row[1].startswith(f"{NON_E}, ")]
+    rows = [row[2:5] for row in sentences() if row[1].startswith(f"{NON_E}, ")]
     assert rows == [[*claim[1:]] for claim in claims]
 
 
 def test_pages__name_every_figure_and_table_of_the_paper() -> None:
     for label in (label for item in ITEMS for label in item.labels):
-        assert f"`{label}`" in RESULTS
+        assert f"`{label}`" in PAGE

@@ -20,7 +20,7 @@ from tests.refused import refused
 
 SCENARIO, GAME = eb.open_game("paper-random")
 
-MEANS = {  # harm of docs/results/best-harm.md, m2/s2: first-impact, total
+MEANS = {  # harm of docs/least-harm.md, m2/s2: first-impact, total
     "cooperation-2-blocked": (16.609, 16.718), "cooperation-2-five": (11.554, 11.640),
     "paper-delay-high": (21.930, 22.089), "paper-delay-low": (0.160, 0.162), "paper-delay-middle": (1.915, 1.938),
     "paper-distance": (1.044, 1.063), "paper-random": (6.427, 6.482), "paper-random-brake-only": (7.891, 7.960),
