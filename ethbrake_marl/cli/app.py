@@ -197,7 +197,7 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
     COMMANDS.add(name, built, lambda registered: registered is built)
 
 
-_OURS = tuple(str(info.name) for info in (*app.registered_commands, *app.registered_groups))
+_OURS = (*(str(info.name) for info in app.registered_commands), *(str(info.name) for info in app.registered_groups))
 COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.fromkeys(_OURS))
 
 
