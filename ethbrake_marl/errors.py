@@ -6,7 +6,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
@@ -250,11 +250,3 @@ def check_whole_number(what: str, value: object, least: int, most: int | None = 
     if not (is_whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"
         raise InvalidInput(f"{what} = {value!r}: must be a whole number{right}")
-
-
-def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> None:
-    """Raise ``InvalidInput`` unless ``learners`` has exactly one vehicle; the message ends with ``advice``."""
-    if len(learners) != 1:
-        raise InvalidInput(
-            f"scenario {scenario!r} has {len(learners)} learners ({', '.join(learners) or 'none'}); {advice}"
-        )

@@ -9,7 +9,7 @@ import re
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Annotated, Any
 
@@ -116,7 +116,7 @@ def _status_of(arguments: Sequence[str]) -> int:
     try:
         with naming_extras():
             command = whole_command()
-            if _shell_asks(os.environ):
+            if _COMPLETE in os.environ and ("COMP_WORDS" in os.environ or "_TYPER_COMPLETE_ARGS" in os.environ):
                 return shell_complete(command, {}, "ethbrake", _COMPLETE, os.environ[_COMPLETE])
             with command.make_context("ethbrake", [*arguments]) as context:
                 command.invoke(context)
@@ -127,17 +127,6 @@ def _status_of(arguments: Sequence[str]) -> int:
             Out().note(stop.code)
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     return 0
-
-
-def _shell_asks(environment: Mapping[str, str]) -> bool:
-    """Whether a shell has started this program to complete a command line (see ``--show-completion``).
-
-    False if only one of the shell's variables for completion is set: it may remain from an earlier command.
-    """
-    if environment.get(_COMPLETE) == "complete_bash":
-        return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
-    instructions = ("complete_zsh", "complete_fish", "complete_powershell", "complete_pwsh")
-    return environment.get(_COMPLETE) in instructions and "_TYPER_COMPLETE_ARGS" in environment
 
 
 def _refuse(reason: str) -> int:
