@@ -6,11 +6,12 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
 from numbers import Integral
+from pkgutil import resolve_name
 from sysconfig import get_paths
 
 from ethbrake_marl.renamed import new_name
@@ -25,7 +26,12 @@ _LIBRARIES = tuple(get_paths()[key] for key in ("stdlib", "platstdlib", "purelib
 
 _MOST_SUGGESTED = 3  # names that an error message suggests
 
-NAMES: dict[str, Callable[[], Iterable[str]]] = {}  # kind such as ``agent`` -> function that lists all its names
+NAMES = {  # kind -> place of its names, or of a function that lists them; imported only when an error needs them
+    "agent": "ethbrake_marl.names:AGENTS",
+    "shield or search": "ethbrake_marl.names:WRAPPERS",
+    "scenario": "ethbrake_marl.worlds.catalogue:scenario_paths",
+    "recipe": "ethbrake_marl.training.recipe:shipped_recipes",
+}
 
 
 def plain_text(text: str, keep: str = "") -> str:
@@ -231,7 +237,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     advice = f"; your own {kind} must be registered or installed first (docs/extend.md)" if may_be_own else ""
     hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"known: {', '.join(names) or 'none'}{advice}"
     first = re.split("[,:+@]", text)[0]
-    others = sorted(other for other in NAMES.keys() - {kind} if kind in NAMES and first in NAMES[other]())
+    tables = {other: resolve_name(place) for other, place in NAMES.items() if kind in NAMES and other != kind}
+    others = [other for other, table in tables.items() if first in (table() if callable(table) else table)]
     if others:
         hint = f"{first!r} names another kind: {', '.join(others)}; were two values swapped?"
     return UnknownName(f"unknown {kind} {name!r}; {new_name(kind, name) or hint}")
@@ -243,11 +250,3 @@ def check_whole_number(what: str, value: object, least: int, most: int | None = 
     if not (is_whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"
         raise InvalidInput(f"{what} = {value!r}: must be a whole number{right}")
-
-
-def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> None:
-    """Raise ``InvalidInput`` unless ``learners`` has exactly one vehicle; the message ends with ``advice``."""
-    if len(learners) != 1:
-        raise InvalidInput(
-            f"scenario {scenario!r} has {len(learners)} learners ({', '.join(learners) or 'none'}); {advice}"
-        )

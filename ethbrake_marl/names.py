@@ -24,7 +24,7 @@ from typing import Any
 from ethbrake_marl.agents.team import UNSTATED, Agent, Team, check_agent, check_knows
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game, Script
-from ethbrake_marl.errors import NAMES, EthBrakeError, InvalidInput, UnknownName, describe_error
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, UnknownName, describe_error
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -129,7 +129,6 @@ def _add(table: Registry[AgentEntry], name: str, make: Any, about: str, knows: s
 
 AGENTS: Registry[AgentEntry] = Registry("agent", "agents", register_agent)
 WRAPPERS: Registry[AgentEntry] = Registry("shield or search", "shields", register_shield)
-NAMES |= {table.kind: table.__iter__ for table in (AGENTS, WRAPPERS)}
 
 
 def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:

@@ -12,11 +12,12 @@ first used, the entry point is loaded and its value is passed to the ``register_
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.resources import files
+from operator import attrgetter
 from threading import RLock
 from typing import Any, TypeVar
 
@@ -59,7 +60,10 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
     """Entry points of a group such as ``agents``, by name: this package's first. Several packages may use one name."""
     by_name: dict[str, list[EntryPoint]] = {}
     foreign_points = [point for point in entry_points(group=f"ethbrake_marl.{group}") if giver(point) != DISTRIBUTION]
-    for point in (*sorted(package_points(group), key=by_its_name), *sorted(foreign_points, key=by_its_name)):
+    for point in (
+        *sorted(package_points(group), key=attrgetter("name")),
+        *sorted(foreign_points, key=attrgetter("name")),
+    ):
         by_name.setdefault(point.name, []).append(point)
     return by_name
 
@@ -74,10 +78,6 @@ def package_points(group: str) -> list[EntryPoint]:
         table = import_module(f"{place}.parts").PARTS.get(group, {})
         part_points += [EntryPoint(name, f"{place}.{value}", group) for name, value in table.items()]
     return part_points
-
-
-def by_its_name(point: EntryPoint) -> str:
-    return point.name
 
 
 def giver(point: EntryPoint) -> str:
@@ -207,6 +207,5 @@ class Registry(Mapping[str, T]):
             return str(error)
         return None
 
-    def unknown(self, name: object, known: Iterable[str] | None = None) -> UnknownName:
-        """Error for an unknown name. ``known``: names to suggest or list; None: all."""
-        return unknown_name(self.kind, name, self if known is None else known, may_be_own=True)
+    def unknown(self, name: object) -> UnknownName:
+        return unknown_name(self.kind, name, self, may_be_own=True)

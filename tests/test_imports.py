@@ -120,6 +120,22 @@ assert "EthBrake-v2" in sys.modules["gymnasium"].registry
     assert (status, err) == (0, "")
 
 
+@pytest.mark.parametrize(
+    ("use", "hint"),
+    [
+        (
+            "worlds.catalogue import load_scenario as load; name = 'universal+step'",
+            "'universal' names another kind: agent",
+        ),
+        ("training.recipe import load_recipe as load; name = 'step'", "'step' names another kind: shield or search"),
+    ],
+)
+def test_unknown_name__hint_is_the_same_whatever_was_imported_before(use: str, hint: str) -> None:
+    program = f"from ethbrake_marl.{use}\ntry:\n    load(name)\nexcept ValueError as error:\n    print(error)"
+    status, out, err = ended(program)
+    assert (status, err) == (0, "") and hint in out
+
+
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
 
 

@@ -9,7 +9,7 @@ import pytest
 from rich.text import Text
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli.command import Out, print_note
+from ethbrake_marl.cli.command import Out
 from ethbrake_marl.errors import (
     LINE_LIMIT,
     AlreadyExists,
@@ -25,7 +25,7 @@ from ethbrake_marl.errors import (
 
 def test_control_characters__are_shown_not_sent(capsys: pytest.CaptureFixture[str]) -> None:
     assert plain_text("a\tb\nc\r", keep="\n\t") == "a\tb\nc\\r"
-    print_note("runs/\x1b[2J\nx")
+    Out().note("runs/\x1b[2J\nx")
     assert capsys.readouterr().err == "runs/\\x1b[2J\\nx\n"
     Out().show("# \u202egnp\n", Text("[/] ppo@\x1b[31m :smile:"), "6\N{NO-BREAK SPACE}m/s²")
     assert capsys.readouterr().out == "# \\u202egnp\n\n[/] ppo@\\x1b[31m :smile:\n6\N{NO-BREAK SPACE}m/s²\n"

@@ -14,7 +14,7 @@ import ethbrake_marl as eb
 from ethbrake_marl import kernel_store
 from ethbrake_marl.files import store
 from ethbrake_marl.parallel import run_each
-from ethbrake_marl.worlds.explain import new_scenario_text
+from ethbrake_marl.worlds.scenario_file import new_scenario_text
 
 WITHOUT = """
 import os, signal, sys, sysconfig

@@ -155,12 +155,12 @@ def range_of(policy: Any, ask: Ask, features: int, who: str) -> TrainingRange | 
     if text is None:
         return None
     try:
-        known = TrainingRange.model_validate_json(text)
+        training_range = TrainingRange.model_validate_json(text)
     except ValidationError as error:
         raise InvalidInput(f"{who}: training_range in the model's metadata: {first_mistake(error)}") from None
-    if len(known.low) != features:
+    if len(training_range.low) != features:
         raise InvalidInput(f"{who}: training_range in the model's metadata must have {features} features")
-    return known
+    return training_range
 
 
 def count_of_actions(policy: Any, count: int | None, who: str) -> int | None:

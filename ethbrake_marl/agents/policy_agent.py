@@ -44,34 +44,21 @@ class RangeMemory(NamedTuple):
     outside: Ints  # [n] number of decisions so far outside the range of the policy's training
 
 
-class RangedAgent(Observer):
-    """Base class of agents with a policy: outside the range of its training they follow its fallback, if it has one."""
-
-    def known_range(self) -> TrainingRange | None:
-        raise NotImplementedError
-
-    def observe(self, view: View, state: State, body: int) -> Observations:
-        raise NotImplementedError
-
-    def begin_range(self, n: int) -> RangeMemory | None:
-        """Memory that counts decisions outside the range; None if the range is unknown."""
-        return None if self.known_range() is None else RangeMemory(np.zeros(n, np.int64))
-
-    def in_range(
-        self, observations: Observations, actions: Floats, state: State, memory: RangeMemory | None, body: int
-    ) -> tuple[Floats, RangeMemory | None]:
-        """The policy's ``actions`` [n], or the fallback's where ``observations`` [n, F] are outside; the new memory."""
-        known = self.known_range()
-        if known is None:
-            return actions, memory
-        outside = known.is_outside(observations) & ~state.ended
-        if known.fallback and outside.any():
-            actions[outside] = self.observe(View([known.fallback]), state.take(outside), body)[:, 0]
-        return actions, None if memory is None else RangeMemory(memory.outside + outside)
+def follow_fallback(
+    agent: LearnedAgent | PolicyAgent, observations: Observations, actions: Floats, state: State, memory: Any, body: int
+) -> tuple[Floats, RangeMemory | None]:
+    """The policy's ``actions`` [n], or the fallback's where ``observations`` [n, F] are outside; the new memory."""
+    training_range = agent.training_range
+    if training_range is None:
+        return actions, memory
+    outside = training_range.is_outside(observations) & ~state.ended
+    if training_range.fallback and outside.any():
+        actions[outside] = agent.observe(View([training_range.fallback]), state.take(outside), body)[:, 0]
+    return actions, None if memory is None else RangeMemory(memory.outside + outside)
 
 
 @dataclass(frozen=True)
-class LearnedAgent(RangedAgent):
+class LearnedAgent(Observer):
     """Drives with the deterministic actions of a policy of this package.
 
     >>> import ethbrake_marl as eb
@@ -110,15 +97,16 @@ class LearnedAgent(RangedAgent):
             )
 
     def begin(self, alert: State, body: int) -> RangeMemory | None:
-        return self.begin_range(alert.n)
+        return None if self.training_range is None else RangeMemory(np.zeros(alert.n, np.int64))
 
     def act(self, state: State, memory: RangeMemory | None, body: int) -> tuple[Floats, RangeMemory | None]:
         observations = self.observe(self.policy.observation, state, body)
         actions = self.policy(observations)[:, 0].astype(np.float64)
-        actions, memory = self.in_range(observations, actions, state, memory, body)
+        actions, memory = follow_fallback(self, observations, actions, state, memory, body)
         return commands_of(state, body, actions), memory
 
-    def known_range(self) -> TrainingRange | None:
+    @property
+    def training_range(self) -> TrainingRange | None:
         return self.policy.manifest.training_range
 
     def observe(self, view: View, state: State, body: int) -> Observations:
@@ -126,7 +114,7 @@ class LearnedAgent(RangedAgent):
 
 
 @dataclass(frozen=True)
-class PolicyAgent(RangedAgent):
+class PolicyAgent(Observer):
     """Drives with a policy of another library; made by ``policy_agent``. It can be pickled if the policy can."""
 
     policy: Any
@@ -152,7 +140,7 @@ class PolicyAgent(RangedAgent):
 
     def begin(self, alert: State, body: int) -> Any:
         if self.initial_state is None:
-            return self.begin_range(alert.n)
+            return None if self.training_range is None else RangeMemory(np.zeros(alert.n, np.int64))
         return self._own(self.initial_state(alert.n), alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
@@ -163,7 +151,7 @@ class PolicyAgent(RangedAgent):
         observations = self.observe(self.observation, state, body)
         if self.initial_state is None:
             actions = self._actions(self.ask(self.policy, observations), state, body)
-            actions, memory = self.in_range(observations, actions, state, memory, body)
+            actions, memory = follow_fallback(self, observations, actions, state, memory, body)
         else:
             pair = self.policy(observations, self._own(memory, state.n))
             if not isinstance(pair, tuple) or len(pair) != 2:
@@ -171,9 +159,6 @@ class PolicyAgent(RangedAgent):
                 raise AgentFailed(self.name, None, f"vehicle_{body}: returned {pair!r:.60}; {right}")
             actions, memory = self._actions(pair[0], state, body), self._own(pair[1], state.n)
         return commands_of(state, body, actions), memory
-
-    def known_range(self) -> TrainingRange | None:
-        return self.training_range
 
     def observe(self, view: View, state: State, body: int) -> Observations:
         return observe_through(self.layers, view, state, body, self.time_step_s)
@@ -291,8 +276,8 @@ def policy_agent(
             stacklevel=2,
         )
     time_step_s = math.nan if trained_in is None else trained_in.time_step_s
-    known = range_of(policy, ask, len(view.names), who)
-    return PolicyAgent(policy, name, ask, view, is_assumed, time_step_s, initial_state, clip, actions, known)
+    training_range = range_of(policy, ask, len(view.names), who)
+    return PolicyAgent(policy, name, ask, view, is_assumed, time_step_s, initial_state, clip, actions, training_range)
 
 
 def _view(observation: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:

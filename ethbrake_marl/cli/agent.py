@@ -59,16 +59,16 @@ def agent_show(
         if not isinstance(agent, LearnedAgent):
             raise InvalidInput(f"agent {name!r}: is no trained policy; name one, such as universal or policy@runs/mine")
         manifest = agent.policy.manifest
-        known = manifest.training_range
-        if known is None:
+        training_range = manifest.training_range
+        if training_range is None:
             raise InvalidInput(f"agent {name!r}: its file does not say what it observed in training; train it again")
         text = f"{name}: {', '.join(manifest.learners)} in {manifest.scenario.get('name')}, by {manifest.algorithm}."
-        if known.fallback:
-            text += f" Outside the range of its training it follows {known.fallback}."
+        if training_range.fallback:
+            text += f" Outside the range of its training it follows {training_range.fallback}."
         if scenario is not None:
             share = float(evaluate(scenario, name, episodes=SHOWN_EPISODES)[name]["outside"].mean())
             text += f" In {scenario}, {100 * share:.0f} % of its decisions are outside."
-        ends = zip(agent.policy.observation.features, known.low, known.high, strict=True)
+        ends = zip(agent.policy.observation.features, training_range.low, training_range.high, strict=True)
         columns = (
             Column("Feature", "feature", text=True),
             Column("From", "from"),

@@ -9,8 +9,7 @@ import re
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from copy import copy
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Annotated, Any
 
@@ -23,7 +22,7 @@ from typer.main import get_command, get_group
 from ethbrake_marl import __version__
 from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
 from ethbrake_marl.cli.command import INTERRUPTED, Out, example
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, describe_error, naming_extras
+from ethbrake_marl.errors import EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.registry import DISTRIBUTION, Registry, giver, points
 from ethbrake_marl.renamed import new_name
 
@@ -117,7 +116,7 @@ def _status_of(arguments: Sequence[str]) -> int:
     try:
         with naming_extras():
             command = whole_command()
-            if _shell_asks(os.environ):
+            if _COMPLETE in os.environ and ("COMP_WORDS" in os.environ or "_TYPER_COMPLETE_ARGS" in os.environ):
                 return shell_complete(command, {}, "ethbrake", _COMPLETE, os.environ[_COMPLETE])
             with command.make_context("ethbrake", [*arguments]) as context:
                 command.invoke(context)
@@ -128,17 +127,6 @@ def _status_of(arguments: Sequence[str]) -> int:
             Out().note(stop.code)
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     return 0
-
-
-def _shell_asks(environment: Mapping[str, str]) -> bool:
-    """Whether a shell has started this program to complete a command line (see ``--show-completion``).
-
-    False if only one of the shell's variables for completion is set: it may remain from an earlier command.
-    """
-    if environment.get(_COMPLETE) == "complete_bash":
-        return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
-    instructions = ("complete_zsh", "complete_fish", "complete_powershell", "complete_pwsh")
-    return environment.get(_COMPLETE) in instructions and "_TYPER_COMPLETE_ARGS" in environment
 
 
 def _refuse(reason: str) -> int:
@@ -198,14 +186,7 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
     COMMANDS.add(name, built, lambda registered: registered is built)
 
 
-def _names() -> list[str]:
-    return [
-        *(info.name or info.callback.__name__.replace("_", "-") for info in app.registered_commands if info.callback),
-        *(str(group.name) for group in app.registered_groups),
-    ]
-
-
-_OURS = tuple(_names())
+_OURS = (*(str(info.name) for info in app.registered_commands), *(str(info.name) for info in app.registered_groups))
 COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.fromkeys(_OURS))
 
 
@@ -243,39 +224,19 @@ def with_installed(group: Any, name: str) -> Any:
     return group
 
 
+def whole_command() -> Any:
+    """The program with all commands: the core's, those of installed packages, and those of ``add_command``."""
+    return _build_commands(*COMMANDS, *COMMANDS.loaded.values())
+
+
 @cache
 def _build_commands(*registered: object) -> Any:
-    """The commands of ``app``, built once (100 ms) as long as the same commands are registered. Do not change them."""
-    return get_command(app)
-
-
-def _copy_command(command: Any) -> Any:
-    """Copy of a command. If the command is a group, commands can be added to the copy without changing the original."""
-    copied = copy(command)
-    if hasattr(command, "commands"):
-        copied.commands = {name: _copy_command(subcommand) for name, subcommand in command.commands.items()}
-    return copied
-
-
-def whole_command() -> Any:
-    """The program with all commands: the core's, those of installed packages, and those of ``add_command``.
-
-    Raises ``AlreadyExists`` if two commands have the same name.
-    """
-    added = [name for name in COMMANDS if name not in _OURS and "." not in name]
-    names = [*_names(), *added]
-    for k, name in enumerate(names):
-        if name in names[:k]:
-            raise AlreadyExists(
-                f"command {name!r} already exists; give your command another name: app.command('my-{name}')"
-            )
-    groups = [info.typer_instance for info in app.registered_groups if info.typer_instance]
-    registered = [command for group in (app, *groups) for command in group.registered_commands]
-    program: Any = _copy_command(_build_commands(*registered, *app.registered_groups))
+    """The whole program, built once (100 ms) as long as the same names and commands are registered."""
+    program: Any = get_command(app)
     for name in _OURS:
         with_installed(program.commands[name], name)
-    installed = [name for name in points(COMMANDS.group) if "." not in name]
-    program.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*installed, *added]}
+    added = [*points(COMMANDS.group), *(name for name in COMMANDS if name not in _OURS)]
+    program.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in added if "." not in name}
     group_names = dict.fromkeys(entry.partition(".")[0] for entry in points(COMMANDS.group))
     for name in (group_name for group_name in group_names if group_name not in program.commands):
         group = get_group(typer.Typer(name=name, help="Commands of installed packages.", add_completion=False))

@@ -76,11 +76,6 @@ def example(*lines: str) -> str:
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 
-def print_note(text: str) -> None:
-    with suppress(OSError):  # nobody can be told
-        typer.echo(one_line(text), err=True)
-
-
 class Out:
     """Output of a command, used as ``with Out() as out``.
 
@@ -111,7 +106,7 @@ class Out:
         if isinstance(error, SystemExit):
             raise InvalidInput(f"your own code ended the process: SystemExit: {error.code}") from error
 
-    def result(self, content: Any, *parts: RenderableType, end: str = "\n", in_file: bool = False) -> None:
+    def result(self, content: Any, *parts: RenderableType, in_file: bool = False) -> None:
         """Print the result: ``content`` as JSON if the user chose ``--json``, otherwise ``parts``.
 
         ``in_file``: whether a file also contains the result, so that nothing is lost if stdout is closed.
@@ -121,7 +116,7 @@ class Out:
         if self.as_json:
             self.print_json(content)
         else:
-            self.show(*parts, end=end)
+            self.show(*parts)
 
     def print_json(self, content: Any) -> None:
         self.show_progress.end()
@@ -141,7 +136,8 @@ class Out:
 
     def note(self, text: str) -> None:
         self.show_progress.end()
-        print_note(text)
+        with suppress(OSError):  # nobody can be told
+            typer.echo(one_line(text), err=True)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
         """Raise an error, before any work, if a file cannot be written. ``path=None`` means no file.

@@ -50,7 +50,7 @@ def scenario_show(scenario: NameArgument) -> None:
 
     A file that is based on another scenario is printed without its comments.
     """
-    from ethbrake_marl.worlds.explain import whole_text
+    from ethbrake_marl.worlds.scenario_file import whole_text
 
     with Out() as out:
         out.show(whole_text(scenario), end="")
@@ -145,27 +145,12 @@ def _kinds(trial: Trial) -> dict[str, Any]:
     return kinds_of(trial.drawn)
 
 
-def _fold(text: str, most: int, width: int = 80) -> list[str]:
-    return textwrap.wrap(text, width, max_lines=most, placeholder=" ...", break_on_hyphens=False)
+def _fold(text: str, most: int) -> list[str]:
+    return textwrap.wrap(text, 80, max_lines=most, placeholder=" ...", break_on_hyphens=False)
 
 
 def _share(part: int, total: int, things: str = "worlds") -> str:
     return f"{part:,} of {total:,} {things} ({100.0 * part / total:.1f} %)"
-
-
-@scenario_group.command("explain", epilog=example("scenario explain paper-random"))
-def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> None:
-    """Describe a scenario in plain sentences.
-
-    They describe the line of vehicles, who drives each vehicle, and what each key of the file means.
-    """
-    from ethbrake_marl.worlds.catalogue import load_scenario
-    from ethbrake_marl.worlds.explain import sentences
-
-    with Out(as_json=as_json) as out:
-        chosen = load_scenario(scenario)
-        texts = list(sentences(chosen))
-        out.result({"name": chosen.name, "sentences": texts}, *(line for text in texts for line in _fold(text, 6, 100)))
 
 
 @scenario_group.command("new", epilog=example("scenario new my-scenario --based-on paper-distance"))
@@ -181,7 +166,7 @@ def scenario_new(
 
     The file is NAME.yaml. All other keys stand there as comments with their values.
     """
-    from ethbrake_marl.worlds.explain import new_scenario_text
+    from ethbrake_marl.worlds.scenario_file import new_scenario_text
 
     with Out(force=force) as out:
         file = output / f"{name}.yaml"
@@ -228,7 +213,7 @@ def scenario_schema() -> None:
 
     Editors complete and check YAML with it.
     """
-    from ethbrake_marl.worlds.explain import scenario_json_schema
+    from ethbrake_marl.worlds.scenario_file import scenario_json_schema
 
     with Out() as out:
         out.print_json(scenario_json_schema())

@@ -91,6 +91,10 @@ class View:
     def __repr__(self) -> str:
         return f"View({list(self.names)})"
 
+    def __reduce__(self) -> tuple[type[View], tuple[list[str]]]:
+        """Pickle only the names, because functions of features may not be picklable."""
+        return View, ([*self.names],)
+
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
         """Observations of the bodies ``observers`` (1: Vehicle 1), [n, len(observers), F]; this view has F features."""
         plan = self.plan

@@ -34,15 +34,12 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, we
         out[k] = harm
 
 
-def follow_plans(
-    game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf, *, donate: bool = False
-) -> tuple[State, Floats]:
+def follow_plans(game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf) -> tuple[State, Floats]:
     """Last states of episodes whose learners follow ``plans`` from ``state`` on, and the episodes' harm, [n] m2/s2.
 
     ``plans`` [n, T, L] are the actions of the L learners at the first T decisions of the episode; after these the last
     actions repeat. An episode stops when its harm is above ``most`` [n] (m2/s2); the result is then its harm so far. If
     a check of the physics fails, the harm is infinite; but in games with scripts, ``PhysicsError`` is raised.
-    ``donate``: the arrays of ``state`` may be overwritten.
     """
     most = np.full(len(plans), most)
     if game.scripts or game.physics is not None:
@@ -52,8 +49,7 @@ def follow_plans(
             state, _ = game.follow(state, plans[rows, decision])
         return state, state.harm(count)
     line, car, clock, know, wanted, memories = state
-    if not donate:
-        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
+    line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     out, settings = np.empty(len(plans)), game.settings
     play_worlds(
         line, car, clock, wanted, plans, most, settings.learners, settings.time_step_s, weights_of(count),

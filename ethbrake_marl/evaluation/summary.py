@@ -124,7 +124,7 @@ class SummaryTable(list[SummaryRow]):
         exploits = [f"{row.agent} {' and '.join(row.exploits.values())}" for row in self if row.exploits]
         if exploits:
             notes.append(f"{EXPLOITS} Harm does not count this: {'; '.join(exploits)} (docs/train.md).")
-        elsewhere = [f"{row.agent} in {100 * row.outside:.0f} %" for row in self if row.is_elsewhere]
+        elsewhere = [f"{row.agent} in {100 * row.outside:.0f} %" for row in self if row.is_outside]
         if elsewhere:
             notes.append(
                 "Share of decisions with observations outside the range of the policy's training:"
@@ -300,7 +300,7 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
         "Passed: no vehicle collides in any world. Harm: mean per world in m²/s². Hardest: largest closing speed of any"
         " first impact."
     )
-    elsewhere = [f"{row.agent} in {name}" for name, table in tables.items() for row in table if row.is_elsewhere]
+    elsewhere = [f"{row.agent} in {name}" for name, table in tables.items() for row in table if row.is_outside]
     if elsewhere:
         note += f" More than 10 % of its decisions are outside the range of its training: {', '.join(elsewhere)}."
     return Sheet("", columns, rows, note)

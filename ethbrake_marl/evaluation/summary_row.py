@@ -54,7 +54,7 @@ class SummaryRow:
         return 0.0 if share is None else share.value
 
     @property
-    def is_elsewhere(self) -> bool:
+    def is_outside(self) -> bool:
         return self.outside > OUTSIDE_SHARE
 
     @property

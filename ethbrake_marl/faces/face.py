@@ -73,7 +73,7 @@ class Face:
 
     def describe_world(self) -> dict[str, Any]:
         """Drawn values of the first running world, as plain numbers and texts."""
-        return {name: column[0].item() for name, column in self.describe_worlds().items()}
+        return {name: column.tolist()[0] for name, column in self.describe_worlds().items()}
 
     def render(self) -> Any:
         """Pictures in the form that the render mode defines."""

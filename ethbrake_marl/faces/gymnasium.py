@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import steps_to_horizon
-from ethbrake_marl.errors import check_one_learner
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import Metadata
 from ethbrake_marl.faces.spaces import action_space, checked_actions, feature_box, reward_box
@@ -54,8 +54,12 @@ class OneLearner(Face):
         self._open(open_game(*game), render_mode, most_steps)
         self.bodies, self.actions = self.game.settings.learners, actions
         names = [self.scenario.vehicle_names[i - 1] for i in self.bodies]
-        advice = "pass learners=['vehicle_2'], or use parallel_env or make_sb3_vec_env"
-        check_one_learner(self.scenario.name, names, f"this environment needs exactly one learner: {advice}")
+        if len(names) != 1:
+            raise InvalidInput(
+                f"scenario {self.scenario.name!r} has {len(names)} learners ({', '.join(names) or 'none'}); this"
+                " environment needs exactly one learner: pass learners=['vehicle_2'], or use parallel_env or"
+                " make_sb3_vec_env"
+            )
         (self.name,) = names
         if components := self.game.rewarding.components:  # as MO-Gymnasium has it
             self.reward_space, self.reward_dim = reward_box(components), len(components)

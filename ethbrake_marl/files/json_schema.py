@@ -23,15 +23,3 @@ class FileSchema(GenerateJsonSchema):
     @staticmethod
     def publish(schema: dict[str, Any]) -> dict[str, Any]:
         return {"$schema": DIALECT, **schema}
-
-
-def schema_lines(kind: str, command: str) -> str:
-    """Comment lines for a new YAML file that name its JSON Schema and the command that prints it.
-
-    ``kind`` is ``scenario`` or ``recipe``; ``command`` is a subcommand such as ``scenario schema``.
-    """
-    return (
-        f"# yaml-language-server: $schema={kind}.schema.json\n"
-        "# To let your editor complete and check this file, write the schema into the same folder:\n"
-        f"#   ethbrake {command} > {kind}.schema.json\n"
-    )

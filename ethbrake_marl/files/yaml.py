@@ -112,22 +112,22 @@ class Document:
             raise type(error)(f"{self.where(path)}: {error}") from None
 
 
-def read_yaml(path: str | Path, limit: int = YAML_SIZE_LIMIT) -> Document:
-    """Content of a YAML file of at most ``limit`` bytes.
+def read_yaml(path: str | Path) -> Document:
+    """Content of a YAML file of at most ``YAML_SIZE_LIMIT`` bytes.
 
     Raises ``InvalidInput`` with file, line, column and reason.
     """
-    return parse_yaml(read_plain(path, limit), str(Path(path)), limit)
+    return parse_yaml(read_plain(path, YAML_SIZE_LIMIT), str(Path(path)))
 
 
-def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = YAML_SIZE_LIMIT) -> Document:
-    """Content of a YAML document of at most ``limit`` bytes. ``file``: name of the document in messages.
+def parse_yaml(text: str | bytes, file: str = "<text>") -> Document:
+    """Content of a YAML document of at most ``YAML_SIZE_LIMIT`` bytes. ``file``: name of the document in messages.
 
     Raises ``InvalidInput`` with file, line, column and reason.
     """
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
-    if len(data) > limit:
-        raise InvalidInput(f"{file}: is larger than {limit // 1024} KiB, the limit for this kind of file")
+    if len(data) > YAML_SIZE_LIMIT:
+        raise InvalidInput(f"{file}: is larger than {YAML_SIZE_LIMIT // 1024} KiB, the limit for this kind of file")
     try:
         decoded = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -124,7 +124,7 @@ def kernel(function: Function) -> Function:
     return _compile(function, forceinline=True, pipeline_class=_PartCompiler)
 
 
-def shared(function: Function) -> Function:
+def part(function: Function) -> Function:
     """Compile a function as ``kernel`` does, but without inlining it: for long functions with several callers."""
     return _compile(function, pipeline_class=_PartCompiler)
 

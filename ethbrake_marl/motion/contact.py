@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.motion.compiling import kernel, shared
+from ethbrake_marl.motion.compiling import kernel, part
 
 
 @kernel
@@ -39,7 +39,7 @@ def contact(gap, closing, pressing):
     return math.inf, 0.0
 
 
-@shared
+@part
 def contact_on_cubic(gap, closing, pressing, jerk, end):
     """Time (s) and closing speed (m/s) of a pair's first contact before ``end`` (s); ``(inf, 0)`` if there is none.
 
@@ -57,11 +57,11 @@ def contact_on_cubic(gap, closing, pressing, jerk, end):
         first, second = min(far_root, near_root), max(far_root, near_root)
     elif jerk < 0.0:
         return math.inf, 0.0
-    for part in range(2):
+    for stretch in range(2):
         if jerk > 0.0:  # the gap closes up to the first root, and from the second one on
-            low, high = (0.0, min(first, end)) if part == 0 else (max(second, 0.0), end)
+            low, high = (0.0, min(first, end)) if stretch == 0 else (max(second, 0.0), end)
         else:
-            low, high = (max(first, 0.0), min(second, end)) if part == 0 else (0.0, 0.0)
+            low, high = (max(first, 0.0), min(second, end)) if stretch == 0 else (0.0, 0.0)
         if not low < high or gap_after(gap, closing, pressing, jerk, high) > 0.0:
             continue
         time = low

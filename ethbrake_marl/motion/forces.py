@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from ethbrake_marl.motion.compiling import kernel, large, shared
+from ethbrake_marl.motion.compiling import kernel, large, part
 from ethbrake_marl.motion.layout import (
     ACTIVE,
     BRAKE_RATE,
@@ -44,7 +44,7 @@ def force_now(force, command, brake_rate, release_rate):
     return command if math.isinf(brake_rate if command < force else release_rate) else force
 
 
-@shared
+@part
 def driving(force, command, brake_rate, release_rate, duration):
     """Speed (m/s) that the engine alone gives in ``duration`` (s), and the force (m/s2) at the end.
 

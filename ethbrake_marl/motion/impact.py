@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.motion.compiling import kernel, shared
+from ethbrake_marl.motion.compiling import kernel, part
 from ethbrake_marl.motion.forces import settle
 from ethbrake_marl.motion.layout import (
     BEFORE,
@@ -54,7 +54,7 @@ PLASTIC_MPS = 0.05  # a cluster whose largest closing speed is below this does n
 SAME_MPS2 = 5e-13  # touching bodies with accelerations closer than this move alike
 
 
-@shared
+@part
 def pool(mass, low, high, low_jerk, high_jerk, scratch, first, last, value, jerk):
     """Write the isotonic regression of bodies ``first..last`` to ``value`` and ``jerk``; return the number of blocks.
 
@@ -142,7 +142,7 @@ def resolve_cluster(line, car, scratch, first, last):
             line[SPEED, i] = min(line[SPEED, i], line[SPEED, i - 1])
 
 
-@shared
+@part
 def note_thrown(line, scratch, p):
     """Add the change of pair p's closing speed in an impact to the row THROWN; the pair has had an impact before.
 
@@ -156,7 +156,7 @@ def note_thrown(line, scratch, p):
     line[THROWN, p] += change
 
 
-@shared
+@part
 def after_impact_of(car, scratch, first, last, body):
     """Speed (m/s) of ``body`` after the impact if only the bodies ``first..last`` existed."""
     largest = 0.0
@@ -173,7 +173,7 @@ def after_impact_of(car, scratch, first, last, body):
     return scratch[POOLED, body] + bounce * (scratch[POOLED, body] - before)
 
 
-@shared
+@part
 def note_passed(line, car, scratch, first, last):
     """Add the harm that the contacts of a cluster pass on in an impact to the row PASSED. Two bodies pass nothing on.
 
@@ -191,7 +191,7 @@ def note_passed(line, car, scratch, first, last):
             line[PASSED, p] += (rear - front) * (rear - front) - closing * closing
 
 
-@shared
+@part
 def next_of_series(car, scratch, now, first, last):
     """Pair that is struck next in a cluster's endless series of impacts; -1: no series, the whole cluster is struck.
 

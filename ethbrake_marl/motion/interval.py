@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.motion.compiling import kernel, large, shared
+from ethbrake_marl.motion.compiling import kernel, large, part
 from ethbrake_marl.motion.contact import contact, contact_on_cubic, first_return, gap_after
 from ethbrake_marl.motion.forces import acts, driving, force_now, force_range, plan_force, settle
 from ethbrake_marl.motion.impact import pool, resolve_impacts
@@ -74,7 +74,7 @@ def crossing_s(below, rate):
     return math.inf if rate <= 0.0 else max(-below / rate, 0.0) + LATE_S + LATE_MPS2 / rate
 
 
-@shared
+@part
 def parting_s(car, scratch, head, tail):
     """Time (s) until the bodies ``head..tail``, which move as one block, part or start to move; infinite: never.
 
@@ -337,7 +337,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds, exceeds, l
     return outcome
 
 
-@shared
+@part
 def through_interval_building(line, car, scratch, start, until, ahead, exceeds, limit):
     """``through_interval`` for a line in which some force follows its command at a finite rate."""
     return through_interval(line, car, scratch, start, until, ahead, True, exceeds, limit)

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.motion.compiling import kernel, shared
+from ethbrake_marl.motion.compiling import kernel, part
 from ethbrake_marl.motion.impact import SAME_MPS2
 from ethbrake_marl.motion.layout import ACCELERATION, HIGH, JERK, JOINED, LOW, LOW_JERK, MASS, PART, PART_RATE, PUSHED
 
@@ -68,7 +68,7 @@ def group_acceleration(car, scratch, body, last, toward, side, held):
     return toward * (max(most, 0.0) if held else most)
 
 
-@shared
+@part
 def gain(car, scratch, body, last, toward, side, side_jerk, held, duration):
     """Change of speed (m/s) from ``group_acceleration`` over ``duration`` (s), while brakes build up.
 

@@ -31,7 +31,10 @@ class TrainingRange(FiniteModel):
         if len(self.low) != len(self.high) or not np.less_equal(self.low, self.high).all():
             raise ValueError("low, high: must have one number for each feature, low at most high")
         if self.fallback:
-            feature_named(self.fallback)
+            action = feature_named(self.fallback)
+            if (action.unit, action.scale, action.low) != ("1", 1.0, -1.0) or action.high > 1.0:
+                right = "must be an action: a feature of unit 1 and scale 1 that is from -1 to at most 1"
+                raise ValueError(f"fallback = {self.fallback}: {right}")
         return self
 
     @classmethod

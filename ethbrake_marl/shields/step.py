@@ -47,7 +47,6 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
-from ethbrake_marl.shields.proposals import compare, follow_plan, note_trial
 from ethbrake_marl.shields.shield import NamedShield, ShieldReason, check_drivers, checked_drivers, spread
 
 NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
@@ -57,7 +56,6 @@ NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, be
 NO_DECISION, SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED, POLICY_ROLLOUT = map(
     int, ShieldReason
 )
-COMPARISONS = SAME_AS_PLAN, NO_CERTIFICATE, NOT_A_NUMBER, ENDED  # reasons before any trial
 
 
 class StepShieldMemory(NamedTuple):
@@ -192,10 +190,14 @@ class StepShield:
         proposed, state = self.collect_proposals(game, state, proposed)
         if not donate:
             memory = memory._replace(plan=memory.plan.copy(), price=memory.price.copy())
-        bound, now, ended, shape = self.bound(memory), state.steps, state.ended, proposed.shape
-        candidates, margin, reason = np.empty(shape), np.empty(shape), np.empty(shape, np.int64)
-        compare(ended, now, memory.plan, proposed, bound - memory.price, COMPARISONS, candidates, margin, reason)
+        bound, worlds, now, shape = self.bound(memory), np.arange(state.n), state.steps, proposed.shape
+        decision, running = np.minimum(now, memory.plan.shape[1] - 1), ~state.ended[:, np.newaxis]
+        planned = memory.plan[worlds, decision]
+        reason = np.where(proposed == planned, SAME_AS_PLAN, NO_CERTIFICATE)
+        reason = np.where(running, np.where(np.isnan(proposed), NOT_A_NUMBER, reason), ENDED)
         deviates = reason == NO_CERTIFICATE
+        candidates = np.where(deviates, proposed, planned)
+        margin = (bound - memory.price)[:, np.newaxis].repeat(shape[1], axis=1)
         rejected = deviates.any(axis=1).nonzero()[0]
         for number, columns in enumerate(trials(shape[1])):
             if not len(rejected):
@@ -209,15 +211,16 @@ class StepShield:
             if len(rows):
                 rests = self.rests[:1] if number else self.rests  # what the agents propose, they propose together
                 why, least = self.accept(game, state, memory, rows, actions, now[rows], rests)
-                note_trial(rows, trial_mask, why, bound[rows] - least, reason, margin)
+                reason[rows] = np.where(trial_mask, why[:, np.newaxis], reason[rows])
+                margin[rows] = np.where(trial_mask, (bound[rows] - least)[:, np.newaxis], margin[rows])
                 if number == 0:
                     rejected = rows[why == NO_CERTIFICATE]
-        applied, replaced = np.empty(shape), memory.replaced.copy()
-        intervened = np.zeros((state.n, state.vehicles), np.bool_)
-        follow_plan(ended, now, memory.plan, proposed, game.settings.learners, applied, intervened, replaced)
+        applied = memory.plan[worlds, decision]
+        differ = running & (applied != proposed)
         return applied, memory._replace(
             agents=tuple(state.memories[body] for body in self.drivers), proposed=proposed, applied=applied,
-            intervened=intervened, replaced=replaced, reason=reason, margin=margin,
+            intervened=spread(game, state, differ, False), replaced=memory.replaced + differ.sum(axis=1), reason=reason,
+            margin=margin,
         )  # fmt: skip
 
     def collect_proposals(self, game: Game, state: State, proposed: Floats | None) -> tuple[Floats, State]:

@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 
 from ethbrake_marl.episode.features import listed_features
 from ethbrake_marl.episode.reward import RewardParams, registered_terms
-from ethbrake_marl.errors import NAMES, InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.model import NAME_PATTERN, FileModel, NonNegative, Positive, Wording, read_model, refuse
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.policies.network import Activation, NetworkSpec
@@ -267,9 +267,6 @@ def shipped_recipes() -> dict[str, Path]:
 def usable_recipes() -> dict[str, Path]:
     """Name -> file of shipped recipes whose algorithm is installed."""
     return {name: file for name, file in shipped_recipes().items() if _algorithm_in(read_yaml(file)) in ALGORITHMS}
-
-
-NAMES["recipe"] = shipped_recipes
 
 
 def load_recipe(recipe: str | Path | Mapping[str, Any] | TrainingRecipe) -> TrainingRecipe:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from ethbrake_marl.errors import NAMES, AlreadyExists, IgnoredName, InvalidInput, unknown_name
+from ethbrake_marl.errors import AlreadyExists, IgnoredName, InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS, changed_content
 from ethbrake_marl.worlds.scenario import Scenario, plain
@@ -56,7 +56,7 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
     if not files:
         raise InvalidInput(f"folder of scenarios {os.fspath(folder)!r}: has no file that ends in .yaml")
     known = {
-        name: registered_path for name, registered_path in _known_paths().items() if registered_path.parent != path
+        name: registered_path for name, registered_path in scenario_paths().items() if registered_path.parent != path
     }
     for file in files:
         if file.stem in known:
@@ -102,7 +102,7 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
     is the name of a shipped or registered scenario. If there is no such scenario, the text is the path of an existing
     file, without the ending. Raises ``UnknownName`` if there is no such file either.
     """
-    text, paths = str(name_or_path), _known_paths()
+    text, paths = str(name_or_path), scenario_paths()
     path = folder / Path(text).expanduser()
     if path.suffix in (".yaml", ".yml"):
         return path
@@ -124,7 +124,7 @@ def group_of_scenarios(name: str) -> list[str]:
 def list_scenarios() -> list[CatalogueEntry]:
     """Shipped and registered scenarios, sorted by name. Their files are not checked."""
     entries = []
-    for name, path in sorted(_known_paths().items()):
+    for name, path in sorted(scenario_paths().items()):
         content = read_yaml(path).content
         title = str(content.get("title", "")) if isinstance(content, dict) else ""
         origin = "shipped" if path.is_relative_to(shipped_folder()) else str(path.parent)
@@ -132,12 +132,9 @@ def list_scenarios() -> list[CatalogueEntry]:
     return entries
 
 
-def _known_paths() -> dict[str, Path]:
+def scenario_paths() -> dict[str, Path]:
     registered = (path for folder in FOLDERS.values() for path in folder.glob("*.yaml"))
     return {path.stem: path for path in (*registered, *shipped_folder().rglob("*.yaml"))}
-
-
-NAMES["scenario"] = _known_paths
 
 
 def _build_scenario(document: Document, folder: Path, above: tuple[Path, ...]) -> Scenario:

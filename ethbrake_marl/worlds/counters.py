@@ -17,7 +17,7 @@ Numbers = Callable[[int, tuple[int, ...]], Floats]  # (width, stream) -> uniform
 PURPOSES: dict[str, int] = {"list": 0, "training": 1}
 
 MOST_AT_ONCE = 10_000_000  # worlds of one call
-_MOST_WORLDS = 2**62  # worlds of one seed: their numbers are 64-bit integers
+_MOST_WORLDS = 2**52  # worlds of one seed: a clock holds their numbers as floats
 _PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
 
@@ -26,7 +26,7 @@ def world_numbers(n: int, seed: int, first: int, purpose: str) -> Ints:
     check_whole_number("number of worlds", n, 1, MOST_AT_ONCE)
     check_whole_number("seed of the list", seed, 0)
     check_whole_number("first world", first, 0, _MOST_WORLDS)
-    if purpose not in PURPOSES:
+    if purpose not in [*PURPOSES]:
         raise InvalidInput(f"sample: purpose = {purpose!r}: must be one of {', '.join(PURPOSES)}")
     return np.arange(int(first), int(first) + int(n), dtype=np.int64)
 

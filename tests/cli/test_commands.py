@@ -56,8 +56,6 @@ FISH = {"_ETHBRAKE_COMPLETE": "complete_fish", "_TYPER_COMPLETE_ARGS": "ethbrake
         ({"_ETHBRAKE_COMPLETE": "bash_source"}, None),  # no shell sets these: nothing changes
         ({"_ETHBRAKE_COMPLETE": "1"}, None),
         ({"_ETHBRAKE_COMPLETE": "complete_bash"}, None),
-        ({"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake", "COMP_CWORD": "x"}, None),
-        ({"_ETHBRAKE_COMPLETE": "complete_tcsh", "_TYPER_COMPLETE_ARGS": "ethbrake"}, None),
     ],
 )
 def test_completion__a_shell_that_asks_gets_what_can_follow(monkeypatch, capsys, asked, answered) -> None:

@@ -16,7 +16,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.pairwise import CLOSED_FORM_CANDIDATES, find_candidates, harm_of_deceleration, pairwise
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.motion.layout import BRAKING, LATENCY
-from ethbrake_marl.worlds.explain import new_scenario_text
+from ethbrake_marl.worlds.scenario_file import new_scenario_text
 from ethbrake_marl.worlds.user_worlds import worlds_from_table
 from tests.docs.printed import BLOCK, PAGES, PICTURES, ROOT, TABLES, missing_figures, pictures, rows, tables
 from tests.docs.site import DOCS, load

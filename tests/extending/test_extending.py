@@ -13,7 +13,7 @@ import yaml
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.motion.layout import FIRST, MASS
-from ethbrake_marl.worlds.explain import new_scenario_text
+from ethbrake_marl.worlds.scenario_file import new_scenario_text
 from tests.training.tiny import TINY
 
 near = pytest.approx

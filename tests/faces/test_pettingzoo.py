@@ -1,5 +1,6 @@
 """PettingZoo: agents, what each is given, vector rewards, and refusals of actions and settings."""
 
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -82,6 +83,21 @@ def test_vector_rewards__are_the_harm_that_each_vehicle_bears() -> None:
     assert rewards["vehicle_1"] in env.reward_space("vehicle_1") and env.reward_spaces.keys() == rewards.keys()
     with refused("reward_space: rewards are numbers here"):
         scalar.reward_space("vehicle_1")
+
+
+@pytest.mark.parametrize("scenario", ["paper-random-preference", "cooperation-2-five"])
+def test_environment__can_be_pickled_before_and_after_it_observes(scenario: str) -> None:
+    env = began(scenario=scenario)
+    env.step({"vehicle_2": [-0.5]})
+    copied = pickle.loads(pickle.dumps(env))
+    action = {"vehicle_2": [-0.25]}
+    assert copied.step(action)[0]["vehicle_2"].tolist() == env.step(action)[0]["vehicle_2"].tolist()
+
+
+def test_seed__may_have_more_than_64_bits() -> None:
+    env = EthBrakeParallelEnv()
+    infos = env.reset(seed=2**70)[1]
+    assert env.describe_world()["world_seed"] == infos["vehicle_2"]["world_seed"] == 2**70
 
 
 def test_indices__are_evenly_spaced_actions() -> None:

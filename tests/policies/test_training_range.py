@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.episode.features import FEATURES, register_feature
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import CorruptBundle
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.training_range import TrainingRange
 from tests.policies.test_bundles import make_policy
@@ -31,11 +34,17 @@ def test_outside__three_features_by_more_than_the_margin() -> None:
     assert FOUR.is_outside(observations).tolist() == [False, True, False, True]
 
 
-def test_policy__keeps_its_range_in_its_file(tmp_path: Path) -> None:
+def brakes_fully(state: State, body: int) -> Floats:
+    """Full braking as an action."""
+    return np.full(state.n, -1.0)
+
+
+def test_policy__keeps_its_range_in_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FEATURES, "loaded", dict(FEATURES.loaded))
+    register_feature("brakes_fully", brakes_fully, unit="1", scale=1.0, low=-1.0, high=1.0)
     policy = make_policy()
     size = len(policy.observation.features)
-    known = TrainingRange(low=(0.0,) * size, high=(1 / 3,) * size, fallback="front_1.gap")
-    ranged = policy.with_range(known)
+    ranged = policy.with_range(TrainingRange(low=(0.0,) * size, high=(1 / 3,) * size, fallback="brakes_fully"))
     assert policy.manifest.training_range is None and "training_range" not in policy.manifest.model_dump()
     ranged.save(tmp_path / "a")
     assert load_policy(tmp_path / "a").manifest == ranged.manifest != policy.manifest
@@ -52,6 +61,11 @@ def test_policy__keeps_its_range_in_its_file(tmp_path: Path) -> None:
             "training_range: low, high: must have one number for each feature, low at mo",
         ),
         ({"low": (0.0,), "high": (1.0,), "fallback": "plan.actoin"}, "unknown feature 'plan.actoin'"),
+        (
+            {"low": (0.0,), "high": (1.0,), "fallback": "front_1.gap"},
+            "training_range: fallback = front_1.gap: must be an action: a feature of unit 1 and scale 1",
+        ),
+        ({"low": (0.0,), "high": (1.0,), "fallback": "own.restitution"}, "= own.restitution: must be an action"),
     ],
 )
 def test_bad_range__is_refused(change: dict[str, Any], text: str, tmp_path: Path) -> None:

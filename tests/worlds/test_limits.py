@@ -10,9 +10,9 @@ import jsonschema
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.worlds.explain import scenario_json_schema
 from ethbrake_marl.worlds.quantities import QUANTITIES
 from ethbrake_marl.worlds.scenario import Scenario
+from ethbrake_marl.worlds.scenario_file import scenario_json_schema
 from ethbrake_marl.worlds.user_worlds import worlds_from_state
 from tests.refused import refused
 

@@ -10,9 +10,9 @@ import pytest
 from ethbrake_marl.errors import IgnoredName, UnknownName
 from ethbrake_marl.files.yaml import parse_yaml
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.explain import new_scenario_text
 from ethbrake_marl.worlds.roles import check_role
 from ethbrake_marl.worlds.scenario import Scenario
+from ethbrake_marl.worlds.scenario_file import new_scenario_text
 from ethbrake_marl.worlds.user_worlds import worlds_from_state
 from tests.refused import refused
 

@@ -136,8 +136,10 @@ REFUSED: dict[str, Callable[[], object]] = {
     "number of worlds = 0: must be a whole number in 1..10000000": lambda: PAPER.sample(n=0, seed=1),
     "number of worlds = 10000001: must be a whole number in 1..10000000": lambda: PAPER.sample(n=10000001, seed=1),
     "seed of the list = None: must be a whole number, at least 0": lambda: PAPER.sample(n=1, seed=None),
-    "first world = -1: must be a whole number in 0..4611686018427387904": lambda: PAPER.sample(n=1, seed=1, first=-1),
+    "first world = -1: must be a whole number in 0..4503599627370496": lambda: PAPER.sample(n=1, seed=1, first=-1),
+    "first world = 4503599627370497: must be a whole number": lambda: PAPER.sample(n=1, seed=1, first=2**52 + 1),
     "sample: purpose = 'test': must be one of list, training": lambda: PAPER.sample(n=1, seed=1, purpose="test"),
+    "sample: purpose = ['list']: must be one of list, training": lambda: PAPER.sample(n=1, seed=1, purpose=["list"]),
     "scenario 'paper-random': early_impacts: reject, but in all 1000 draws of": lambda: CLOSE.sample(1, 0),
     "1000 draws of world 0 an impact happens before vehicle_3 can act; use larger": lambda: (
         CLOSE.replace(gaps_m=2, latency_s=[0, 0.5, 1]).with_learners(["vehicle_3"]).sample(1, 0)

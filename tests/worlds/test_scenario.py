@@ -15,7 +15,7 @@ from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import NUMBER
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.yaml import read_yaml
-from ethbrake_marl.worlds import catalogue, explain, sampling
+from ethbrake_marl.worlds import catalogue, sampling, scenario_file
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, load_scenario
 from ethbrake_marl.worlds.counters import uniform_numbers
 from ethbrake_marl.worlds.describe import clusters_of, columns_of, fixed_columns
@@ -201,10 +201,9 @@ def test_shipped_scenario__goes_round(name: str, empty_folder: Path) -> None:
     assert pickle.loads(pickle.dumps(scenario)) == scenario == copy.deepcopy(scenario)
     for key in scenario.model_fields_set - {"vehicles"}:
         assert scenario.replace(**{key: getattr(scenario, key)}) == scenario, key
-    assert next(explain.sentences(scenario)).startswith(f"{name}: ")
-    Path("mine.yaml").write_text(explain.new_scenario_text("mine", name))
+    Path("mine.yaml").write_text(scenario_file.new_scenario_text("mine", name))
     assert bits(load_scenario("mine.yaml").sample(5, 7)) == bits(scenario.sample(5, 7))
-    Path(f"{name}.yaml").write_text(explain.whole_text(name))
+    Path(f"{name}.yaml").write_text(scenario_file.whole_text(name))
     table = {} if scenario.table is None else {"table": scenario.table}
     assert table or load_scenario(f"{name}.yaml") == scenario
 
@@ -328,21 +327,13 @@ def test_catalogue__takes_folders_of_new_names(empty_folder: Path, monkeypatch: 
         catalogue.register_scenarios("sub")
 
 
-def test_sentences__say_what_each_key_means() -> None:
-    said = [*explain.sentences(line(v2x="congested", roles={"vehicle_3": "coast", "vehicle_2": "learner"}))]
-    assert said[1] == "3 vehicles in line, vehicle_1 in front, no obstacle ahead. Learners: vehicle_2."
-    assert said[2:4] == ["Script full_brake: vehicle_1.", "Script coast: vehicle_3."]
-    assert "mass_t: [4.5, 5.5, 5.9] (mass of each vehicle)." in said
-    assert any(each.startswith("v2x: {preset: congested} (what each vehicle knows") for each in said)
-    mixed = [*explain.sentences(load_scenario("mixture-delays"))]
-    assert any(each.startswith("mixture: {") for each in mixed)
-    assert not any(each.startswith("mass_t: ") for each in mixed)
-    key = next(key for key in explain.listed_keys() if key.name == "time_gaps_s")
-    assert key.comment.endswith("; finite and in (0, 60] s (seconds); give either this key or gaps_m")
+def test_new_file__says_of_each_key_its_range_and_what_it_replaces() -> None:
+    text = scenario_file.new_scenario_text("mine")
+    assert "; finite and in (0, 60] s (seconds); give either this key or gaps_m\n# time_gaps_s: " in text
 
 
 def test_json_schema__accepts_what_the_reader_accepts() -> None:
-    editor = jsonschema.Draft202012Validator(explain.scenario_json_schema())
+    editor = jsonschema.Draft202012Validator(scenario_file.scenario_json_schema())
     for entry in list_scenarios():
         if entry.name in SHIPPED:
             assert not [*editor.iter_errors(read_yaml(entry.path).content)], entry.name

@@ -20,9 +20,9 @@ from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.explain import check_file_name
 from ethbrake_marl.worlds.quantities import QUANTITIES, RECORDING
 from ethbrake_marl.worlds.scenario import Scenario
+from ethbrake_marl.worlds.scenario_file import check_file_name
 
 with naming_extras():
     from ethbrake_marl.extensions.recorded.chains import cut_chains

@@ -68,6 +68,7 @@ def watch_command(
                 return
             except (InvalidInput, MissingExtra) as error:
                 out.note(f"no window: {error}")
+            out.check(Path(DEFAULT_FILE))
         path = output or Path(DEFAULT_FILE)
         what = "pictures" if path.suffix.lower() == ".png" else "film"
         out.write(path, WRITERS[path.suffix.lower()](films), what=what)

@@ -79,8 +79,10 @@ def show_in_window(films: Films) -> None:
 
     Raises ``MissingExtra`` without pygame-ce, and ``InvalidInput`` if no window can be opened.
     """
-    frames = [*stack_films(films)]
+    drawn = stack_films(films)
+    frames = [next(drawn)]
     screen = Screen(frames[0])
+    frames += drawn
     for frame in frames + FPS * LAST_S * frames[-1:]:
         if not screen.show(frame, FPS):
             break

@@ -51,10 +51,10 @@ class Viewer:
 
         return picture(scene)
 
-    def step_frames(self, fps: int = SMOOTH_FPS, row: int = 0) -> list[Any]:
-        """Pictures of the last time step of world ``row``, ``fps`` per simulated second; each [304, 800, 3] uint8."""
+    def step_frames(self, fps: int = SMOOTH_FPS) -> list[Any]:
+        """Pictures of the last time step of the first world, ``fps`` per simulated second; each [304, 800, 3] uint8."""
         check_whole_number("step_frames: fps", fps, 1)
-        motion = self.motion(row)
+        motion = self.motion(0)
         count = max(round((motion.until_s - motion.start_s) * fps), 1)
         times: Floats = np.linspace(motion.start_s, motion.until_s, count + 1)[1:]
         return [Viewer.show(self, motion.scene(float(time_s))) for time_s in times]

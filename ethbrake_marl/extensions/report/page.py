@@ -37,7 +37,7 @@ class Section(NamedTuple):
     folded: bool = False  # whether the reader must open it
 
 
-def whole_page(title: str, lead: str, opening: Sequence[Markup], sections: Sequence[Section]) -> str:
+def whole_page(title: str, lead: str, opening: Sequence[str], sections: Sequence[Section]) -> str:
     """Complete HTML page. ``lead``: text below the title. ``opening``: parts above the table of contents."""
     style, script = (Markup("\n".join(map(read_file, names))) for names in (_STYLES, _SCRIPTS))
     values = {"title": title, "lead": lead, "opening": opening, "sections": sections, "style": style, "script": script}
@@ -47,11 +47,6 @@ def whole_page(title: str, lead: str, opening: Sequence[Markup], sections: Seque
 def page_part(name: str, *values: object) -> Markup:
     macros = _environment().get_template("parts.html.j2").module
     return Markup(getattr(macros, name)(*values))
-
-
-def page_text(part: str) -> Markup:
-    """HTML of a part: HTML stays unchanged, and a text becomes a paragraph."""
-    return part if isinstance(part, Markup) else page_part("paragraph", part)
 
 
 def table(sheet: Sheet) -> Markup:

@@ -20,7 +20,8 @@ from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.figures import harm_above, harm_by_agent
-from ethbrake_marl.extensions.report.page import Section, drawing, page_part, page_text, table, whole_page
+from ethbrake_marl.extensions.report.page import Section, drawing, page_part, table, whole_page
+from ethbrake_marl.extensions.report.three_tests import SHORT_TABLE
 from ethbrake_marl.files.sheet import CellText, Column, Sheet
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Bools
@@ -87,7 +88,6 @@ def value(row: SummaryRow, key: str) -> str:
     return Column("").show(row[key]).value
 
 
-SHORT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the first table, if they are shown
 HONEST_COST = {
     "Honest cost": "Total harm, plus penalties for pushing a vehicle, for impacts passed on through touching vehicles,"
     " for speeding up, and for motion at the end. Unlike harm alone, it cannot be lowered by pushing."
@@ -154,7 +154,7 @@ class ReportPage:
             page_part("remarks", [*self.remarks, *rows.notes()]),
             page_part("beside", short_table(rows, compared.harm_count), harm),
             page_part("box", "What is compared", HONEST_COST | agents_in_words(compared.teams)),
-            *map(page_text, episodes_section(compared, focus, kinds).body),
+            *episodes_section(compared, focus, kinds).body,
         ]
         lead = first_sentence(compared, focus, test_results)
         sections.sort(key=lambda section: section.folded)
@@ -182,7 +182,7 @@ def agents_in_words(teams: Iterable[str]) -> dict[str, str]:
 def short_table(agents: SummaryTable, harm_count: str) -> Markup:
     """Table of the most important columns. The count that agents minimise comes first, so that a phone shows it."""
     sheet, first = agents.sheet(), COLUMN[harm_count]
-    chosen = [k for k, name in enumerate(sheet.names) if name in SHORT]
+    chosen = [k for k, name in enumerate(sheet.names) if name in SHORT_TABLE]
     chosen.sort(key=lambda k: sheet.names[k] != first)
     return table(replace(sheet.only([0, *chosen]), title="Means with 95 % intervals, m²/s²"))
 

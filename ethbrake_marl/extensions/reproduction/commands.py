@@ -49,7 +49,7 @@ def reproduce_command(
 
     The command prints how long the work takes, and then one table: each number and statement of the paper, ours, our
     verdict and a reason. Shipped policies drive; only a policy that has not converged is trained. It writes a page
-    (README.md) with this table and all items, and figures (SVG, PDF) and tables (CSV, LaTeX) of each. An item is a
+    (README.md) with this table and all items, and figures (SVG, PDF) and tables (CSV) of each. An item is a
     figure or a table of the paper. After an interruption, repeat the command: trainings go on where they were.
     """
     with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_REPRODUCTION) as out:

@@ -18,7 +18,6 @@ from ethbrake_marl.errors import count_of, unknown_name
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.reproduction.changes import reproduce_changes
 from ethbrake_marl.extensions.reproduction.curves import reproduce_delays, reproduce_distance, reproduce_illustration
-from ethbrake_marl.extensions.reproduction.documents import latex, markdown
 from ethbrake_marl.extensions.reproduction.learning import (
     DENSE,
     HIGH,
@@ -167,7 +166,7 @@ def command_line(settings: ReproductionSettings, items: Sequence[Item]) -> str:
 
 
 def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[DrawnFigure] = ()) -> None:
-    """Write figures as SVG and PDF, and tables as CSV and LaTeX, to the folder ``place``. Replace existing files."""
+    """Write figures as SVG and PDF, and tables as CSV, to the folder ``place``. Replace existing files."""
     if figures or sheets:
         place.mkdir(parents=True, exist_ok=True)
     for picture in figures:
@@ -176,7 +175,16 @@ def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[DrawnFigu
     for sheet in sheets:
         stem = re.sub(r"[^a-z0-9]+", "-", sheet.title.lower()).strip("-") or "claims"
         write_output(place / f"{stem}.csv", sheet.csv().encode(), force=True)
-        write_output(place / f"{stem}.tex", f"{latex(sheet)}\n".encode(), force=True)
+
+
+def markdown(sheet: Sheet) -> str:
+    """Table without sections as Markdown, without its title and note."""
+    rule = ["---" if column.text else "---:" for column in sheet.formats]
+    rows = [
+        [cell.in_words.replace("|", "\\|") for cell in row if not isinstance(cell, str)]
+        for row in sheet.formatted_rows()
+    ]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (sheet.headings, rule, *rows))
 
 
 def plain_results(results: Mapping[Item, Made], settings: ReproductionSettings) -> list[dict[str, Any]]:

@@ -118,13 +118,12 @@ def unconverged_policy(folder: Path) -> str:
     return f"policy@{run / 'policy-last'}"
 
 
-def process(settings: ReproductionSettings, group: str = RANDOM) -> dict[str, list[str]]:
-    """Agent names of policies trained as in the paper: ``PPO`` and ``SAC`` -> one agent name for each seed.
+def process(settings: ReproductionSettings) -> dict[str, list[str]]:
+    """Agent names of policies of the group ``RANDOM``: ``PPO`` and ``SAC`` -> one agent name for each seed.
 
-    ``group``: which trainings, such as ``RANDOM``. Empty unless ``settings.full``. An algorithm with an unfinished
-    training is left out.
+    Empty unless ``settings.full``. An algorithm with an unfinished training is left out.
     """
-    runs = finished_runs(settings.folder, group) if settings.full else {}
+    runs = finished_runs(settings.folder, RANDOM) if settings.full else {}
     return {
         name: [f"policy@{run / 'policy'}" for run in runs[recipe]] for recipe, name in NAMES.items() if recipe in runs
     }

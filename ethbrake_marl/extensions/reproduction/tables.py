@@ -306,7 +306,7 @@ def gradient_claim(outcomes: Mapping[str, RandomOutcome], episodes: int) -> Clai
     return Claim("gradients", f"total harm: {text}", "", "undecided")
 
 
-def process_claims(settings: ReproductionSettings, episodes: int) -> list[Claim]:
+def contribution_claims(settings: ReproductionSettings, episodes: int) -> list[Claim]:
     """Verdicts on both contributions with policies trained as in the paper, in its fixed-step map."""
     outcomes, courses = process_outcomes(STATED, episodes, settings), courses_of(settings, RANDOM)
     return [
@@ -333,7 +333,7 @@ def reproduce_random_table(settings: ReproductionSettings) -> Made:
     claims += [judge(name, parts[name], nearest_parts[name]) for name in parts]
     claims += [avoidance_claim(name, outcomes, nearest_outcomes) for name in policies]
     claims += [*world_claims(outcomes, policies, least), *deceleration_claims(episodes)]
-    claims += [gradient_claim(outcomes, episodes), *process_claims(settings, episodes)]
+    claims += [gradient_claim(outcomes, episodes), *contribution_claims(settings, episodes)]
     sheets = [printed_sheet(RANDOM_TEST), outcomes_sheet("The random test, as stated", outcomes, least), in_map]
     return Made(claims, [*sheets, *process_sheet(settings, STATED, episodes)], notes=[settings.who_drives])
 

@@ -111,11 +111,11 @@ class Less(NamedTuple):
         return self.difference.ends[1] < 0.0
 
 
-def judge_statement(parts: Sequence[Less], show: Column = DIFFERENCE) -> tuple[str, Verdict, str]:
+def judge_statement(parts: Sequence[Less]) -> tuple[str, Verdict, str]:
     """Result in words, verdict and details in words, for a statement that some quantities are smaller than others.
 
     The result says in how many of the comparisons ``parts`` the statement holds. The details are the differences of the
-    comparisons that fail or, if none fails, of the closest one. ``show``: format of these numbers.
+    comparisons that fail or, if none fails, of the closest one.
     """
     compared = [part for part in parts if not part.both_are_0]
     failing = [part for part in compared if not part.holds]
@@ -127,7 +127,7 @@ def judge_statement(parts: Sequence[Less], show: Column = DIFFERENCE) -> tuple[s
     if len(parts) == 1:
         text = ("not shown" if undecided else "does not hold") if failing else "holds"
     named = failing or [max(compared, key=lambda part: part.difference.value)]
-    numbers = "; ".join(f"{part.where}, {show.show(part.difference).in_words}" for part in named)
+    numbers = "; ".join(f"{part.where}, {DIFFERENCE.show(part.difference).in_words}" for part in named)
     return text, ("undecided" if undecided else "differs") if failing else "agrees", numbers
 
 

@@ -183,7 +183,7 @@ def select(world: World, room: Room, starts: Profiles, field: Field) -> None:
         array[0] = best_array[0]
 
 
-def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
+def refine(problem: Problem, commands_mps2: Floats, *, budget: int) -> tuple[Floats, Floats]:
     """Improve one vehicle's commands at T decisions; return the best, [n, T] m/s2, and their values, [n] m2/s2.
 
     The result is at least as good as ``commands_mps2`` [n, T]. Small changes may miss the best commands, so the best of
@@ -195,10 +195,8 @@ def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 
     check_whole_number("budget", budget, 1)
     if len(problem.bodies) != 1:
         raise InvalidInput(f"vehicles {problem.bodies.tolist()}: plans are searched for one controlled vehicle")
-    plans, random = (
-        Profiles.of_steps(commands_mps2[:, :, np.newaxis].copy(), problem.last_step),
-        random_states(problem.identity, seed),
-    )
+    plans = Profiles.of_steps(commands_mps2[:, :, np.newaxis].copy(), problem.last_step)
+    random = random_states(problem.identity, 0)
     problem.check(plans)
     templates, improvement_budget = int(TEMPLATE_SHARE * budget), int(IMPROVEMENT_SHARE * budget)
     times = ATTENTION_S, LONGEST_CHANGE_S, LONGEST_WHILE_S

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.explain import scenario_json_schema, sentences
 from ethbrake_marl.worlds.scenario import Scenario
+from ethbrake_marl.worlds.scenario_file import scenario_json_schema
 from ethbrake_marl.worlds.user_worlds import worlds_from_state
 from tests.extensions.messages.line import LINE
 from tests.refused import refused
@@ -101,8 +101,6 @@ def test_scenario__says_what_is_declared_and_can_be_made_of_it() -> None:
     assert scenario.declared()["v2x"] == {**v2x, "tells": {"vehicle_2": ["place", "mass"]}}
     assert Scenario(**scenario.declared()) == scenario == scenario.replace(title=scenario.title)
     assert scenario != PAPER.replace(v2x={**v2x, "tells": ["mass"]})
-    words = "persistence: periodic, tells: {vehicle_2: [place, mass]}"
-    assert any(words in sentence for sentence in sentences(scenario))
     assert scenario.v2x.drawn and PAPER.v2x.extensions == ()
 
 

@@ -42,14 +42,11 @@ def test_reproduce__writes_page_figures_and_tables(ethbrake: Command, empty_fold
     assert f"version {result['version']}, physics {result['physics_digest']})" in page
     assert "](accelerations/accelerations.svg)" in page and "need --full" in page
     folder = Path("out/accelerations")
-    for name in ("accelerations.svg", "accelerations.pdf", "commands-of-vehicle-2.csv", "commands-of-vehicle-2.tex"):
+    for name in ("accelerations.svg", "accelerations.pdf", "commands-of-vehicle-2.csv"):
         assert (folder / name).stat().st_size > 200
     assert [row["The paper"] for row in rows_of(Path("out/claims.csv"))] == [
         each["The paper"] for each in result["claims"]
     ]
-    assert (
-        Path("out/claims.tex").read_text("utf-8").startswith("\\begin{tabular}{llllll}\n\\toprule\nWhere & The paper")
-    )
     assert done.err.endswith("page: out/README.md\n")
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.extensions.reproduction import verdicts
-from ethbrake_marl.extensions.reproduction.documents import latex, markdown
+from ethbrake_marl.extensions.reproduction.items import markdown
 from ethbrake_marl.extensions.reproduction.verdicts import (
     Claim,
     Less,
@@ -15,7 +15,7 @@ from ethbrake_marl.extensions.reproduction.verdicts import (
     judge_statement,
     sentences_sheet,
 )
-from ethbrake_marl.files.sheet import Column, Estimate, Sheet
+from ethbrake_marl.files.sheet import Estimate
 
 
 def around(value: float, half: float) -> Estimate:
@@ -112,18 +112,3 @@ def test_sentences__are_in_the_papers_order_with_the_reason_for_their_verdict(mo
         "| Fig. 2 | same |  |  | not run | needs --full |",
     ]
     assert [row[-1] for row in sentences_sheet(claims, reasons=False).rows] == ["", "", ""]
-
-
-def test_latex__by_hand() -> None:
-    sheet = Sheet(
-        "", ["Who", Column("Rate_1", digits=1, scale=100.0, unit=" %")], [("a–b", Estimate(0.25, (0.125, 0.5)))]
-    )
-    assert latex(sheet).split("\n") == [
-        r"\begin{tabular}{lr}",
-        r"\toprule",
-        r"Who & Rate\_1 \\",
-        r"\midrule",
-        r"a--b & 25.0 \% {[}12.5, 50.0{]} \\",
-        r"\bottomrule",
-        r"\end{tabular}",
-    ]

@@ -1,69 +1,21 @@
-"""A scenario in words: its keys with ranges and defaults, sentences about it, a new file, the JSON Schema."""
+"""Texts of scenario files: a new file, all values of a scenario, and the JSON Schema for editors."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.json_schema import FileSchema, schema_lines
+from ethbrake_marl.files.json_schema import FileSchema
 from ethbrake_marl.files.model import NAME_PATTERN
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import YAML_SIZE_LIMIT, flow_text, parse_yaml
 from ethbrake_marl.worlds.catalogue import load_scenario, scenario_path
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
 from ethbrake_marl.worlds.quantities import ALTERNATIVES, QUANTITIES
-from ethbrake_marl.worlds.roles import LEARNER
 from ethbrake_marl.worlds.scenario import Scenario
-
-
-class Key(NamedTuple):
-    name: str
-    example: str  # of its value, in YAML
-    about: str
-    comment: str  # what the key means, its range, and which key cannot stand beside it
-
-
-def listed_keys() -> list[Key]:
-    keys, alternatives = [], {**ALTERNATIVES, **{new: usual for usual, new in ALTERNATIVES.items()}}
-    for name, field in Scenario.model_fields.items():
-        about, rule = str(field.description), QUANTITIES.get(name)
-        example = _EXAMPLES.get(name) or flow_text(field.default) if rule is None else rule.example
-        hint = [f"give either this key or {alternatives[name]}"] if name in alternatives else []
-        keys.append(Key(name, example, about, "; ".join([about, *([rule.interval] if rule else []), *hint])))
-    return keys
-
-
-def sentences(scenario: Scenario) -> Iterator[str]:
-    """Sentences that describe a scenario: its line, its roles, and every key that has a value."""
-    yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
-    has_obstacle = {member.has_obstacle for member in scenario.members or (scenario,)}
-    obstacle = (
-        f"{'an' if any(has_obstacle) else 'no'} obstacle ahead{'' if len(has_obstacle) == 1 else ' in some worlds'}"
-    )
-    learners = ", ".join(name for name, role in scenario.roles.items() if role == LEARNER) or "nobody"
-    yield f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {obstacle}. Learners: {learners}."
-    for script in dict.fromkeys(role for role in scenario.roles.values() if role != LEARNER):
-        yield f"Script {script}: {', '.join(name for name, role in scenario.roles.items() if role == script)}."
-    for key in listed_keys():
-        value = getattr(scenario, key.name)
-        if key.name == "mixture" and value is not None:
-            value = {member.name: entry.weight for member, entry in zip(scenario.members, value, strict=True)}
-        if key.name == "table" and value is not None:
-            value = f"{len(value.rows):,} rows with the columns {', '.join(value.columns)}"
-        only_in_members = key.name in QUANTITIES and scenario.members  # a mixture itself has no quantities
-        if (
-            key.name not in ("name", "title", "description", "vehicles", "roles")
-            and value is not None
-            and not only_in_members
-        ):
-            yield f"{key.name}: {flow_text(value)} ({key.about})."
-
-
-# ---- a new file
 
 _HEAD = """\
 # The scenario {base} with other values: remove the # in front of a key and change its value; null takes the key away.
@@ -74,8 +26,10 @@ _HEAD = """\
 #   {{lognormal: {{median: 1.1, sigma: 0.4, low: 0.3, high: 3}}}}    truncated to [low, high]
 #   {{choice: [6, 7, 8]}}    optionally with weights: [1, 2, 1]
 # A single entry is for all vehicles, each of which draws its own value. A list has one entry per vehicle.
-"""
-_WORDS = """
+# yaml-language-server: $schema=scenario.schema.json
+# To let your editor complete and check this file, write the schema into the same folder:
+#   ethbrake scenario schema > scenario.schema.json
+
 name: {name}
 title: One-line title for lists and figures
 description: What the scenario is for.
@@ -109,12 +63,16 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path
     values, path = base.declared(), scenario_path(based_on)
     if path.suffix and path == Path(based_on).expanduser():  # a path, and no name
         based_on = Path(os.path.relpath(path, folder)).as_posix()
-    head = _HEAD.format(name=name, base=base.name) + schema_lines("scenario", "scenario schema")
-    text = head + _WORDS.format(name=name, based_on=flow_text(based_on))
-    for key in listed_keys():
-        if key.name not in ("name", *DESCRIPTIVE_KEYS, "based_on"):
-            short = key.name in values and key.name not in ("mixture", "table")
-            text += f"\n# {key.comment}\n# {key.name}: {flow_text(values[key.name]) if short else key.example}\n"
+    text = _HEAD.format(name=name, base=base.name, based_on=flow_text(based_on))
+    alternatives = ALTERNATIVES | {instead: key for key, instead in ALTERNATIVES.items()}
+    for key, field in Scenario.model_fields.items():
+        if key not in ("name", *DESCRIPTIVE_KEYS, "based_on"):
+            rule, comment = QUANTITIES.get(key), [str(field.description)]
+            comment += [] if rule is None else [rule.interval]
+            comment += [f"give either this key or {alternatives[key]}"] if key in alternatives else []
+            example = _EXAMPLES.get(key) or flow_text(field.default) if rule is None else rule.example
+            short = key in values and key not in ("mixture", "table")
+            text += f"\n# {'; '.join(comment)}\n# {key}: {flow_text(values[key]) if short else example}\n"
     return text
 
 
