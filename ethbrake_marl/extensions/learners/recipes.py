@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from operator import not_
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 
@@ -99,7 +99,12 @@ class ActorShape(FileModel):
 
 
 class VineRecipe(BranchingRecipe):
-    """Recipe of vine: the difference in return between a higher and a lower action gives the gradient."""
+    """Recipe of vine: the difference in return between a higher and a lower action gives the gradient.
+
+    In a mixture of lines, returns are divided by the cost of full braking in the line.
+    """
+
+    mixes_lines: ClassVar[bool] = True
 
     algorithm: Literal["vine"]
     start: Text | None = Field(

@@ -13,10 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
-from ethbrake_marl.extensions.learners.model import BranchingModel
+from ethbrake_marl.extensions.learners.model import BranchingModel, Line, Visited
 from ethbrake_marl.extensions.learners.networks import AveragedNetwork, draw_rows, linear_layers, perceptron
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
 from ethbrake_marl.motion.layout import Floats, Ints
@@ -107,25 +108,27 @@ class VineModel(BranchingModel):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
 
-    def improve(self, observations: Any, states: Any) -> None:
-        self.train_actor(self.try_out(observations, states))
+    def improve(self, visited: Any) -> None:
+        results = [self.try_out(decisions) for decisions in visited]
+        self.train_actor(TrialResults(*(torch.cat(parts) for parts in zip(*results, strict=True))))
 
-    def try_out(self, observations: Float32s, states: State) -> TrialResults:
+    def try_out(self, visited: Visited) -> TrialResults:
         """Results at random visited decisions, simulated with a higher and with a lower action than the policy's."""
-        branches = self.draw_branches(np.flatnonzero(moving(states).repeat(self.learners)))
-        gained, moved = self.play(states, branches)
-        sample = observations[branches.decisions(self.learners)]
-        gradient = self.measured_gradient(torch.from_numpy(gained), torch.from_numpy(moved))
+        line, observations, states = visited
+        branches = self.draw_branches(line, np.flatnonzero(moving(states).repeat(line.learners)))
+        gained, moved = self.play(line.game, states, branches)
+        sample = observations[branches.decisions(line.learners)]
+        gradient = self.measured_gradient(torch.from_numpy(gained / line.cost), torch.from_numpy(moved))
         return TrialResults(torch.from_numpy(sample), torch.from_numpy(self.policy.means(sample)), gradient)
 
-    def draw_branches(self, decisions: Ints) -> Branches:
-        rows, offset = draw_rows(decisions, self.recipe.tried), self.recipe.offset
+    def draw_branches(self, line: Line, decisions: Ints) -> Branches:
+        rows, offset = draw_rows(decisions, line.tried), self.recipe.offset
         ratio = offset.largest / offset.smallest
         sizes: Floats = offset.smallest * ratio ** torch.rand(len(rows), dtype=torch.float64).numpy()
-        world, learner = np.divmod(np.tile(rows, 2), self.learners)
+        world, learner = np.divmod(np.tile(rows, 2), line.learners)
         return Branches(world, learner, np.concatenate([sizes, -sizes]), np.tile(self.drawn_steps(len(rows)), 2))
 
-    def play(self, states: State, branches: Branches) -> tuple[Floats, Floats]:
+    def play(self, game: Game, states: State, branches: Branches) -> tuple[Floats, Floats]:
         """Discounted return of each branch's learner, and how far its actions were moved, [2B] each.
 
         An action stays in [-1, 1], so it may move by less than ``size``. Moves are summed over the steps.
@@ -143,7 +146,7 @@ class VineModel(BranchingModel):
             moved[row] += after - before
             return actions
 
-        gained, _ = play_on(self.game, states.take(world), decide, self.recipe.gamma, at_least=longest)
+        gained, _ = play_on(game, states.take(world), decide, self.recipe.gamma, at_least=longest)
         return gained[np.arange(len(size)), learner], moved
 
     def measured_gradient(self, gained: Tensor, moved: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
+from ethbrake_marl.extensions.learners.model import Visited
 from ethbrake_marl.extensions.learners.networks import linear_layers
 from ethbrake_marl.extensions.learners.start import widen
 from ethbrake_marl.extensions.learners.vine import ClippedActor, TrialResults, trusted_targets
@@ -39,13 +40,13 @@ def test_measured_gradients__are_those_of_the_return_up_to_their_limit(limit: fl
     recipe = VINE.replace(gradient_limit=limit, holds=[2], tried=32, reward={"harm": 1.0, "objective": "own"})
     model = new_model(recipe, PAIR)
     states, seen = model.rows.episode.take(np.arange(8)), model._last_obs
-    tried = model.try_out(seen, states)
+    tried = model.try_out(Visited(model.lines[0], seen, states))
     gradients = tried.gradient.numpy()
     assert len(tried.seen) == 16 and np.abs(gradients).max() > (0.1 if limit > 1.0 else 0.0)
     assert np.abs(gradients).max() <= np.float32(limit)
     row = int(np.abs(gradients).argmax())
     (place,) = np.flatnonzero((seen == tried.seen[row].numpy()).all(axis=1))
-    game, gained = model.game, []
+    game, gained = model.lines[0].game, []
     for offset in (1e-4, -1e-4):
         now, total = states.take([place // 2]), 0.0
         for number in range(200):
