@@ -175,7 +175,8 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     settings = read_object(result.directory / "config.json").get("settings", ())
     options = [setting for setting in settings if read_settings([setting], [*type(plan).model_fields]).scenario]
     options += {"first": [], "honest": ["rules=honest"]}.get(count, [f"harm_count={count}"])
-    words = ["--scenario", scenario or training.scenario.name, "--agents", f"full_brake,{result.agent}"]
+    place = "SCENARIO" if training.scenario.lines else scenario or training.scenario.name  # evaluate needs one line
+    words = ["--scenario", place, "--agents", f"full_brake,{result.agent}"]
     command = shlex.join(
         ["ethbrake", "evaluate", *words, *(word for setting in options for word in ("--set", setting))]
     )

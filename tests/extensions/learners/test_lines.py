@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from ethbrake_marl.extensions.learners.start import ranged_weights
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.train import resume, train
 from tests.extensions.learners.tiny import PAPER, ROLLOUTS, VINE, new_model
+from tests.fixtures.commands import Command, told_json
 from tests.refused import refused
 from tests.training.tiny import dying_after, kept, killed
 
@@ -72,6 +74,20 @@ def test_training__gets_better_in_every_line(tmp_path: Path) -> None:
     first, last = train(ample, LINES, tmp_path / "run", on_progress=None).evaluations
     for name in ("objective_paper-random", "objective_cooperation-2-five"):
         assert last[name] < 0.7 * first[name]
+
+
+def test_command__shows_costs_relative_to_full_braking(ethbrake: Command, empty_folder: Path) -> None:
+    Path("lines.yaml").write_text(json.dumps(LINES.declared()))
+    Path("mixing.yaml").write_text(json.dumps(MIXING.replace(name="mixing", total_steps=40).model_dump(mode="json")))
+    answer = told_json(
+        ethbrake("train", "--recipe", "mixing.yaml", "--scenario", "lines.yaml", "--output", "run", "--json")
+    )
+    braking, trained = answer["fixed_list"]["results"]
+    assert braking["objective"] == pytest.approx(1.0) and trained["objective"] != braking["objective"]
+    assert (
+        answer["next_command"]
+        == "ethbrake evaluate --scenario SCENARIO --agents full_brake,team@run --set rules=honest"
+    )
 
 
 def test_rollout_classification__needs_one_line() -> None:
