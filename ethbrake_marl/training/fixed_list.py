@@ -60,7 +60,7 @@ def full_braking(training: Training) -> dict[str, float]:
 
 
 def braking_cost(training: Training) -> float:
-    """What the training minimises, if all learners brake fully. Raises ``InvalidInput`` if it is 0."""
+    """Mean of what the training minimises, if all learners brake fully. Raises ``InvalidInput`` if it is 0."""
     cost = deciding(full_braking(training), training.recipe.reward.harm_count)
     if not cost > 0.0:
         raise InvalidInput(

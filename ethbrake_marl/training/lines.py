@@ -20,9 +20,6 @@ class LinesVecEnv(VecEnv):
         self.environments, first = environments, environments[0]
         super().__init__(sum(part.num_envs for part in environments), first.observation_space, first.action_space)
 
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        return [row_seed for part in self.environments for row_seed in part.seed(seed)]
-
     def reset(self) -> Observations:
         return np.concatenate([part.reset() for part in self.environments])
 

@@ -158,7 +158,7 @@ class VineModel(BranchingModel):
         measured = (up - down) / (higher - lower)
         gradient = measured.clamp(-self.recipe.gradient_limit, self.recipe.gradient_limit)
         total = float(measured.abs().sum())
-        self.logger.record("train/gradient_cut", 1.0 - float(gradient.abs().sum()) / total if total else 0.0)
+        self.logger.record_mean("train/gradient_cut", 1.0 - float(gradient.abs().sum()) / total if total else 0.0)
         return gradient.float()
 
     def train_actor(self, results: TrialResults) -> None:
