@@ -148,18 +148,12 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
 
     ``scenario``: name or path of the scenario in the printed command; None: the name in the run's folder.
     """
-    from ethbrake_marl.agents.scripts import Held
-    from ethbrake_marl.agents.team import Team, play_to_end
     from ethbrake_marl.cli.settings import read_settings
     from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
     from ethbrake_marl.files.plain import read_object
-    from ethbrake_marl.names import open_game
-    from ethbrake_marl.training.fixed_list import OBJECTIVE_METRIC, metrics_of
+    from ethbrake_marl.training.fixed_list import OBJECTIVE_METRIC, full_braking
 
     training, plan = result.training, result.training.recipe
-    loaded, game = open_game(training.scenario)
-    brake = Team("full_brake", {body: Held("full_brake") for body in loaded.learners})
-    worlds = loaded.sample(plan.evaluation.worlds, plan.evaluation.seed)
     columns = [
         Column("Agent", "agent", text=True),
         Column("First-impact harm", "first_impact_harm"),
@@ -168,7 +162,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     ]
     if (count := plan.reward.harm_count) not in HARM:
         columns.append(Column(IN_WORDS[count].capitalize(), COLUMN[count]))
-    measured = {"full_brake": metrics_of(training, play_to_end(game, worlds, brake))}
+    measured = {"full_brake": full_braking(training)}
     measured[result.agent] = dict(result.metrics or {})
     if OBJECTIVE_METRIC in measured["full_brake"]:
         columns.append(Column("Objective", OBJECTIVE_METRIC))
@@ -181,7 +175,8 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     settings = read_object(result.directory / "config.json").get("settings", ())
     options = [setting for setting in settings if read_settings([setting], [*type(plan).model_fields]).scenario]
     options += {"first": [], "honest": ["rules=honest"]}.get(count, [f"harm_count={count}"])
-    words = ["--scenario", scenario or loaded.name, "--agents", f"full_brake,{result.agent}"]
+    place = "SCENARIO" if training.scenario.lines else scenario or training.scenario.name  # evaluate needs one line
+    words = ["--scenario", place, "--agents", f"full_brake,{result.agent}"]
     command = shlex.join(
         ["ethbrake", "evaluate", *words, *(word for setting in options for word in ("--set", setting))]
     )

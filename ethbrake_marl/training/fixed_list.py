@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from ethbrake_marl.agents.policy_agent import LearnedAgent
-from ethbrake_marl.agents.team import CHUNK, Team, play_to_end
+from ethbrake_marl.agents.scripts import FULL_BRAKE
+from ethbrake_marl.agents.team import CHUNK, Agent, Team, play_to_end
 from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.policy import Policy
@@ -25,22 +27,68 @@ OBJECTIVE_METRIC = "objective"  # mean of what the learners minimise, where that
 
 
 def measure_on_list(training: Training) -> Evaluate:
-    """Function that measures policies (learner -> policy) on the recipe's fixed list of worlds (key ``evaluation``).
+    """Function that measures policies (learner -> policy) on the recipe's fixed list, by ``drive_list``."""
+    drive = drive_list(training)
+    return lambda policies: drive({name: LearnedAgent(policy) for name, policy in policies.items()})
 
-    Metrics are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost`` (for exact impacts),
-    ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a learner's objective is not the
-    harm of the line, there is also each learner's objective (``objective_vehicle_2``), and their mean ``objective``.
+
+def drive_list(training: Training) -> Callable[[Mapping[str, Agent]], dict[str, float]]:
+    """Function that lets agents (learner -> agent) drive the recipe's fixed list of worlds (key ``evaluation``).
+
+    It returns metrics, which are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost`` (for
+    exact impacts), ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a learner's
+    objective is not the harm of the line, there is also each learner's objective (``objective_vehicle_2``), and their
+    mean ``objective``. In a mixture of lines every line has its share of the worlds, and ``objective_NAME`` is what is
+    minimised in the line NAME divided by that of full braking; ``objective`` is its mean over the worlds.
     """
+    if training.scenario.lines:
+        return _drive_lines(training.lines)
     plan, (scenario, game) = training.recipe.evaluation, open_game(training.scenario)
     worlds = scenario.sample(plan.worlds, plan.seed)
     parts = [worlds.take(slice(first, first + CHUNK)) for first in range(0, plan.worlds, CHUNK)]
 
-    def measure(policies: Policies) -> dict[str, float]:
-        drivers = {1 + scenario.vehicle_names.index(name): LearnedAgent(policy) for name, policy in policies.items()}
-        team = Team("policy", drivers)
+    def drive(agents: Mapping[str, Agent]) -> dict[str, float]:
+        team = Team("policy", {1 + scenario.vehicle_names.index(name): agent for name, agent in agents.items()})
         return metrics_of(training, State.join([play_to_end(game, part, team) for part in parts]))
 
-    return measure
+    return drive
+
+
+def full_braking(training: Training) -> dict[str, float]:
+    """Metrics of ``drive_list`` if all learners brake fully."""
+    return drive_list(training)(dict.fromkeys(training.learners, FULL_BRAKE))
+
+
+def braking_cost(training: Training) -> float:
+    """Mean of what the training minimises, if all learners brake fully. Raises ``InvalidInput`` if it is 0."""
+    cost = deciding(full_braking(training), training.recipe.reward.harm_count)
+    if not cost > 0.0:
+        raise InvalidInput(
+            f"scenario {training.scenario.name!r}: full braking costs nothing in the worlds of the fixed list"
+            f" ({training.recipe.evaluation.worlds}), so costs cannot be divided by it; leave the scenario out of the"
+            " mixture, or use a longer list (evaluation.worlds)"
+        )
+    return cost
+
+
+def _drive_lines(lines: Sequence[Training]) -> Callable[[Mapping[str, Agent]], dict[str, float]]:
+    parts = [(line, drive_list(line), braking_cost(line)) for line in lines]
+    worlds = np.array([line.recipe.evaluation.worlds for line in lines], float)
+
+    def drive(agents: Mapping[str, Agent]) -> dict[str, float]:
+        all_metrics, relative_costs = [], {}
+        for line, drive_line, cost in parts:
+            metrics = drive_line({name: agents[name] for name in line.learners})
+            relative = deciding(metrics, line.recipe.reward.harm_count) / cost
+            relative_costs[f"{OBJECTIVE_METRIC}_{line.scenario.name}"] = relative
+            all_metrics.append({**metrics, OBJECTIVE_METRIC: relative})
+        names = [name for name in all_metrics[0] if all(name in metrics for metrics in all_metrics)]
+        columns = {name: np.array([metrics[name] for metrics in all_metrics]) for name in names}
+        return {
+            name: math.fsum(worlds * column) / math.fsum(worlds) for name, column in columns.items()
+        } | relative_costs
+
+    return drive
 
 
 def metrics_of(training: Training, last: State) -> dict[str, float]:

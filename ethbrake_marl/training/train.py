@@ -26,6 +26,7 @@ from ethbrake_marl.registry import versions_used
 from ethbrake_marl.stopping import stop_on_signal
 from ethbrake_marl.training import checkpoint
 from ethbrake_marl.training.fixed_list import Policies, PolicyMeasure, measure_on_list
+from ethbrake_marl.training.lines import LinesVecEnv
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, algorithm_of
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.training import Training, check_new_run
@@ -215,15 +216,18 @@ def _one_training() -> Iterator[Callable[[], bool]]:
         _ONE_TRAINING.release()
 
 
-def make_environment(training: Training) -> EthBrakeVecEnv:
+def make_environment(training: Training) -> EthBrakeVecEnv | LinesVecEnv:
     """Environment of a training, with one row for each learner in each world."""
-    recipe = training.recipe
-    scenario, game = open_game(training.scenario, reward=recipe.reward, observation=list(training.row.names))
-    appended = APPENDED.get(training.scheme)
-    return EthBrakeVecEnv(scenario, game, recipe.n_envs, recipe.seed, recipe.horizon_is_end, appended)
+    environments = []
+    for line in training.lines:
+        recipe = line.recipe
+        scenario, game = open_game(line.scenario, reward=recipe.reward, observation=list(line.row.names))
+        appended = APPENDED.get(line.scheme)
+        environments.append(EthBrakeVecEnv(scenario, game, recipe.n_envs, recipe.seed, recipe.horizon_is_end, appended))
+    return environments[0] if len(environments) == 1 else LinesVecEnv(environments)
 
 
-def make_model(training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
+def make_model(training: Training, environment: EthBrakeVecEnv | LinesVecEnv) -> BaseAlgorithm:
     """New model of Stable-Baselines3, built by the recipe's algorithm. Raises ``InvalidInput`` for VecNormalize."""
     model: BaseAlgorithm = algorithm_of(training.recipe).build(training, environment)
     if model.get_vec_normalize_env() is not None:

@@ -11,6 +11,7 @@ from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.training_range import TrainingRange
 from ethbrake_marl.training.fixed_list import Policies
 from ethbrake_marl.training.training import Training
+from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario
 
 MOST_WORLDS = 1_000  # of the fixed list that are driven
@@ -25,17 +26,20 @@ def with_ranges(policies: Policies, training: Training) -> Policies:
 def record_ranges(policies: Policies, scenario: AnyScenario, worlds: int, seed: int, fallback: str = "") -> Policies:
     """The policies (learner -> policy), each with the range of what it observes in ``worlds`` worlds of ``scenario``.
 
-    Learners that share a policy share its range. ``fallback``: as in ``TrainingRange``.
+    Learners that share a policy share its range. In a mixture of lines, every line has the same number of worlds.
+    ``fallback``: as in ``TrainingRange``.
     """
-    loaded, game = open_game(scenario)
-    drivers = {
-        1 + loaded.vehicle_names.index(name): LearnedAgent(policy.with_range(None)) for name, policy in policies.items()
-    }
+    lines = load_scenario(scenario).lines or (scenario,)
     observed: dict[int, list[Observations]] = {id(policy): [] for policy in policies.values()}
-    for _, state in play(game, loaded.sample(worlds, seed), Team("policy", drivers)):
-        running = state.take(~state.ended)
-        for policy, (body, agent) in zip(policies.values(), game.agents(drivers).items(), strict=True):
-            observed[id(policy)].append(agent.observe(policy.observation, running, body))
+    for line in lines:
+        loaded, game = open_game(line)
+        driven = {body: policies[loaded.vehicle_names[body - 1]] for body in loaded.learners}
+        drivers = {body: LearnedAgent(policy.with_range(None)) for body, policy in driven.items()}
+        alert = loaded.sample(-(-worlds // len(lines)), seed)
+        for _, state in play(game, alert, Team("policy", drivers)):
+            running = state.take(~state.ended)
+            for body, agent in game.agents(drivers).items():
+                observed[id(driven[body])].append(agent.observe(driven[body].observation, running, body))
     ranges = {key: TrainingRange.of(np.concatenate(parts), fallback) for key, parts in observed.items()}
     ranged = {id(policy): policy.with_range(ranges[id(policy)]) for policy in policies.values()}
     return {name: ranged[id(policy)] for name, policy in policies.items()}

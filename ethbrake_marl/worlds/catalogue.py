@@ -187,11 +187,15 @@ def _load_below(what: str, path: Path, above: tuple[Path, ...]) -> Scenario:
 
 
 def _member(document: Document, i: int, entry: Any, folder: Path, above: tuple[Path, ...]) -> Any:
-    """Entry ``i`` of a mixture in which a scenario's name or path is replaced by the content of its file."""
+    """Entry ``i`` of a mixture in which a scenario's name, path or ``based_on`` is replaced by the content."""
     if not isinstance(entry, dict) or "scenario" not in entry:
         return entry
     at: YamlPath = ("mixture", i, "scenario")
     member = entry["scenario"]
+    if isinstance(member, dict) and "based_on" in member:
+        with document.refusing_at(at):
+            loaded = _build_scenario(Document(f"mixture[{i}].scenario", member, {}), folder, above)
+        return {**entry, "scenario": loaded.declared()}
     if not isinstance(member, str):
         return {**entry, "scenario": _with_rows(document, at, member, folder)}
     with document.refusing_at(at):

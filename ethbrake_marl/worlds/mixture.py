@@ -1,4 +1,8 @@
-"""Mixtures: each world is drawn from one of several scenarios, the *members*, chosen by weight."""
+"""Mixtures: each world is drawn from one of several scenarios, the *members*, chosen by weight.
+
+In a *mixture of lines* the members differ in their vehicles or roles. A training can use it, each member with its share
+of the worlds; whatever needs one batch of worlds refuses it.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +24,9 @@ _MIXTURE_KEYS = (
     *DESCRIPTIVE_KEYS,
     "mixture",
 )  # keys of the mixture itself; every other key applies to all members
-# Members must not differ in these.
+# Members must not differ in these, except that a mixture of lines needs only those of _OF_ALL_LINES.
 _ONE_FOR_ALL = ("vehicles", "time_step_s", "horizon_s", "physics", "roles", "objective", "observation")
+_OF_ALL_LINES = ("time_step_s", "physics", "objective", "observation")
 _SHARED_KEYS = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # the mixture has them if all members agree
 
 
@@ -72,15 +77,31 @@ def with_members(content: dict[str, Any], scenario: type[Scenario]) -> dict[str,
     return {key: value for key, value in content.items() if key not in common_content} | shared | {"mixture": mixture}
 
 
+def have_different_lines(members: Sequence[Scenario]) -> bool:
+    return any((member.vehicles, member.roles) != (members[0].vehicles, members[0].roles) for member in members)
+
+
+def require_one_line(scenario: Scenario) -> None:
+    """Raise ``InvalidInput`` for a mixture of lines."""
+    if scenario.lines:
+        names = ", ".join(member.name for member in scenario.lines)
+        raise InvalidInput(
+            f"scenario {scenario.name!r}: its scenarios have different vehicles or roles, so only a training whose"
+            f" algorithm mixes lines can use it; use one of the scenarios here: {names}"
+        )
+
+
 def _check_alike(members: Sequence[Scenario]) -> None:
     """Refuse a member that is listed twice, and members that differ in a key that all must share."""
     first, *later_members = members
     extended = any(member.v2x.extensions for member in members)
+    shared_keys = (*_ONE_FOR_ALL, "v2x") if extended else _ONE_FOR_ALL
+    keys = _OF_ALL_LINES if have_different_lines(members) else shared_keys
     for k, later_member in enumerate(later_members, 1):
         twice = later_member.name in [member.name for member in members[:k]]
         right = f"{later_member.name} is listed twice; list it once, with the sum of its weights"
         require(not twice, ("mixture",), UNSHOWN, right)
-        for key in (*_ONE_FOR_ALL, "v2x") if extended else _ONE_FOR_ALL:
+        for key in keys:
             first_value, later_value = (flow_text(getattr(member, key), 120) for member in (first, later_member))
             right = (
                 f"{key} must be the same in all scenarios of the mixture, but {first.name} has {first_value} and"

@@ -35,7 +35,13 @@ from ethbrake_marl.worlds.channel import V2X
 from ethbrake_marl.worlds.checks import ScenarioWording, check_scenario
 from ethbrake_marl.worlds.counters import Purpose, world_numbers
 from ethbrake_marl.worlds.derived import world_values
-from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS, changed_content, with_members
+from ethbrake_marl.worlds.mixture import (
+    DESCRIPTIVE_KEYS,
+    changed_content,
+    have_different_lines,
+    require_one_line,
+    with_members,
+)
 from ethbrake_marl.worlds.quantities import OF_A_TYPE, OPTIONAL, QUANTITIES, USUAL, check_length, table_columns
 from ethbrake_marl.worlds.quantity import PerVehicle, Quantity, ScenarioPart, Weight, support
 from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role, check_vehicle, names_of
@@ -221,6 +227,10 @@ class Scenario(ScenarioPart):
     def _whole(self) -> Self:
         if self.mixture is None:  # otherwise its members have been checked
             check_scenario(self)
+        elif self.lines:  # not declared, because a declared value replaces those of the members
+            longest = max(self.lines, key=lambda line: line.vehicles)
+            learners = {name: LEARNER for line in self.lines for name, role in line.roles.items() if role == LEARNER}
+            self.__dict__ |= {"vehicles": longest.vehicles, "roles": longest.roles | learners}
         return self
 
     def __repr__(self) -> str:
@@ -259,6 +269,14 @@ class Scenario(ScenarioPart):
     def members(self) -> tuple[Scenario, ...]:
         """Scenarios of a mixture, each with the keys that stand next to ``mixture``; empty if this is no mixture."""
         return tuple(entry.scenario for entry in self.mixture or ())
+
+    @cached_property
+    def lines(self) -> tuple[Scenario, ...]:
+        """Members of a mixture of lines; empty for every other scenario.
+
+        Such a mixture has the ``vehicles`` of its longest line; a vehicle is a learner if it learns in some line.
+        """
+        return self.members if self.mixture and have_different_lines(self.members) else ()
 
     @cached_property
     def vehicle_names(self) -> tuple[str, ...]:
@@ -328,6 +346,7 @@ class Scenario(ScenarioPart):
         Capacities include the limit that the road's friction sets. An undeclared rate of the brakes counts as the
         largest valid rate.
         """
+        require_one_line(self)
         at_once = np.full((2, self.vehicles), QUANTITIES[key].high)
         member_bounds = [world_values(member, member.ends).get(key, at_once) for member in self.members or (self,)]
         lows, highs = np.min(member_bounds, axis=0)[0], np.max(member_bounds, axis=0)[1]
@@ -352,7 +371,8 @@ class Scenario(ScenarioPart):
         members.
         """
         without_words: dict[str, Any] = {"mixture": {"__all__": {"scenario": {*DESCRIPTIVE_KEYS}}}}
-        return self.model_dump(mode="json", exclude=without_words | dict.fromkeys(without, True))
+        derived = ("vehicles", "roles") if self.lines else ()
+        return self.model_dump(mode="json", exclude=without_words | dict.fromkeys((*without, *derived), True))
 
     def replace(self, **changes: Any) -> Scenario:
         """The scenario with changed values, such as ``replace(mass_t=2.0)``; in a mixture every member changes.

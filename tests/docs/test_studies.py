@@ -11,6 +11,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
+from ethbrake_marl.training.training import Training
 from tests.docs.printed import rows as table_of
 from tests.docs.site import DOCS, load
 
@@ -141,3 +142,12 @@ def test_morl_front__its_numbers_agree_with_each_other_and_with_full_braking() -
             assert measured["full_braking"] == full.round(4).tolist()
             assert measured["hypervolume"] == pytest.approx(volume_below(full.round(4), points))
             assert measured["hypervolume_below_roof"] == pytest.approx(volume_below(np.full(3, found["roof"]), points))
+
+
+def test_lines__are_trained_on_by_their_recipe() -> None:
+    training = Training.of("universal-lines", load("../studies/lines").mixture())
+    assert {line.scenario.vehicles for line in training.lines} == {2, 3, 4, 5, 6, 8}
+    assert {body for line in training.lines for body in line.scenario.learners} == {*range(1, 9)}
+    assert sum(line.recipe.n_envs for line in training.lines) == pytest.approx(training.recipe.n_envs, rel=0.02)
+    for line in training.lines:
+        assert line.scenario.sample(5, 7).vehicles == line.scenario.vehicles

@@ -244,8 +244,11 @@ REFUSED: dict[str, Callable[[], object]] = {
     "mine.yaml, line 2: mixture: horizon_s must be the same in all scenarios of the mixture, but": lambda: loaded(
         "mixture: [{scenario: paper-random}, {scenario: stress-wide}]"
     ),
-    "mine.yaml, line 2: mixture: vehicles must be the same in all scenarios of the mixture, but paper-random": lambda: (
-        loaded("mixture: [{scenario: paper-random}, {scenario: cooperation-4-five}]")
+    "mine.yaml, line 2: mixture: time_step_s must be the same in all scenarios of the mixture, but": lambda: loaded(
+        "mixture: [{scenario: paper-random}, {scenario: {name: x, based_on: cooperation-4-five, time_step_s: 0.05}}]"
+    ),
+    "mine.yaml, line 2: mixture[0].scenario: mass_t: has the same value in paper-random; leave it out": lambda: loaded(
+        "mixture: [{scenario: {name: x, based_on: paper-random, mass_t: [4.5, 5.5, 5.9]}}]"
     ),
     "mine.yaml, line 2: mixture[0].scenario: scenario 'paper-random': braking_capacity_mps2: has 3 entries": lambda: (
         loaded("mixture: [{scenario: paper-random}]\nvehicles: 5")

@@ -77,7 +77,7 @@ class CudaVineModel(VineModel):
             *(zeros(*part.shape[:-1], count, dtype=kind, device=place) for part in self.worlds.pool)
         )
         self.seen = self.worlds.reset().repeat(recipe.n_steps, 1, 1)  # [D, L, F]
-        self.each_learner = torch.arange(self.learners, device=place)
+        self.each_learner = torch.arange(self.lines[0].learners, device=place)
         self.played = Graphed(self.play_here, place)
         self.descended = Graphed(super().descend, place)
 
@@ -109,10 +109,10 @@ class CudaVineModel(VineModel):
         return outputs.clamp(-1.0, 1.0).view(observations.shape[:2])
 
     @torch.no_grad()
-    def collect(self, callback: BaseCallback) -> tuple[Tensor, StoredEpisodes]:
-        """Drive all worlds for ``n_steps`` decisions.
+    def collect(self, callback: BaseCallback) -> Tensor:
+        """Drive all worlds for ``n_steps`` decisions, whose states ``visited`` then contains.
 
-        Returns the observations of all learners, [D * L, F], and the states at these decisions.
+        Returns the observations of all learners, [D * L, F].
         """
         worlds = self.worlds
         for step in range(self.recipe.n_steps):
@@ -123,15 +123,14 @@ class CudaVineModel(VineModel):
             worlds.step(self.act(self.seen[rows]))
         worlds.check()
         self.num_timesteps += self.n_envs * self.recipe.n_steps
-        return self.seen.flatten(0, 1), self.visited
+        return self.seen.flatten(0, 1)
 
-    def improve(self, observations: Any, states: Any) -> None:
+    def improve(self, visited: Any) -> None:
         """Update the actor with gradients measured at some of the decisions that ``collect`` visited.
 
-        ``observations`` [D * L, F]: of L learners at all D visited decisions. ``states``: the states there; unused,
-        because ``visited`` contains them.
+        ``visited`` [D * L, F]: observations of L learners at all D visited decisions.
         """
-        self.train_actor(self.measure(observations))
+        self.train_actor(self.measure(visited))
 
     @torch.no_grad()
     def measure(self, observations: Tensor) -> TrialResults:
@@ -141,8 +140,9 @@ class CudaVineModel(VineModel):
         ``observations`` [D * L, F]: of L learners at all D visited decisions.
         """
         place = self.worlds.device
-        branches = self.draw_branches(np.arange(len(observations)))
-        sample = observations[torch.from_numpy(branches.decisions(self.learners)).to(place)]
+        (line,) = self.lines
+        branches = self.draw_branches(line, np.arange(len(observations)))
+        sample = observations[torch.from_numpy(branches.decisions(line.learners)).to(place)]
         gained, moved = self.played(*(torch.from_numpy(column).to(place) for column in branches))
         self.branches.check()
         return TrialResults(sample, self.policy.learning(sample)[:, 0], self.measured_gradient(gained, moved))

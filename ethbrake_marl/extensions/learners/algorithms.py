@@ -9,7 +9,7 @@ import torch
 
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
 from ethbrake_marl.extensions.learners.rollout_classification import RolloutClassificationModel
-from ethbrake_marl.extensions.learners.start import start_weights, starting_policy
+from ethbrake_marl.extensions.learners.start import ranged_weights, start_weights, starting_policy
 from ethbrake_marl.extensions.learners.vine import VineModel
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
 from ethbrake_marl.policies.layers import Float32s
@@ -28,7 +28,12 @@ class Vine(Algorithm):
         model = self.new_model(training, environment)
         if recipe.start is not None:
             policy, network = starting_policy(recipe.start, recipe.name), recipe.network_spec(len(model.features))
-            tensors = start_weights(policy, network, model.features, recipe.name)
+            outside = recipe.network.initial_action
+            if isinstance(outside, str):
+                random = model.policy.tensors("policy")
+                tensors = ranged_weights(policy, random, model.features, outside, recipe.name)
+            else:
+                tensors = start_weights(policy, network, model.features, recipe.name)
             for name, weight in model.policy.weights("policy").items():
                 weight.copy_(torch.from_numpy(tensors[name]))
             model.policy.learning.load_state_dict(model.policy.average.state_dict())

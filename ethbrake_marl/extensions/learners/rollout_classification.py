@@ -6,7 +6,7 @@ Source: Lagoudakis and Parr, Reinforcement Learning as Classification, 2003.
 from __future__ import annotations
 
 import copy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torch.nn.functional import softplus
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
-from ethbrake_marl.extensions.learners.model import BranchingModel
+from ethbrake_marl.extensions.learners.model import BranchingModel, Line, Visited
 from ethbrake_marl.extensions.learners.networks import (
     AveragedNetwork,
     ReplayBuffer,
@@ -98,11 +98,13 @@ class RolloutClassificationModel(BranchingModel):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
 
-    def improve(self, observations: Float32s, states: State) -> None:
+    def improve(self, visited: Any) -> None:
         """Try choices at visited decisions, store their extra costs, and train the network on stored decisions."""
         recipe, chooser = self.recipe, self.policy
+        (decisions,) = visited
+        observations = decisions.observations
         self._update_learning_rate(chooser.optimizer)
-        rows, choices, costs = self.try_choices(observations, states)
+        rows, choices, costs = self.try_choices(decisions)
         extra_costs = costs - costs.min(axis=1, keepdims=True)
         differ = np.flatnonzero(extra_costs.max(axis=1) > 1e-9)
         extra_costs = np.minimum(extra_costs, recipe.largest_cost)
@@ -133,30 +135,30 @@ class RolloutClassificationModel(BranchingModel):
         choices += [torch.randint(last + 1, (count,)).numpy() for _ in range(recipe.drawn)]
         return np.stack(choices, axis=1)
 
-    def try_choices(self, observations: Float32s, states: State) -> tuple[Ints, Ints, Floats]:
+    def try_choices(self, visited: Visited) -> tuple[Ints, Ints, Floats]:
         """Try C choices at B visited decisions, each in a branch that is simulated to the end.
 
         Returns the indices of the decisions, [B], the choices, [B, C], and their costs, [B, C]: minus the return, plus
         the further cost of the recipe's key ``caution``.
         """
-        recipe = self.recipe
-        rows = draw_rows(np.flatnonzero(moving(states).repeat(self.learners)), recipe.tried)
+        recipe, (line, observations, states) = self.recipe, visited
+        rows = draw_rows(np.flatnonzero(moving(states).repeat(line.learners)), recipe.tried)
         tried_choices = self.choices_at(observations[rows])
         branches, branch = ChoiceBranches.of(tried_choices, self.drawn_steps(len(rows)), recipe.network.choices)
         if not recipe.caution:
-            return rows, tried_choices, self.costs_of(states, rows, branches)[branch]
-        cost = self.costs_of(states, rows, branches.with_full_braking(len(rows)))
+            return rows, tried_choices, self.costs_of(line, states, rows, branches)[branch]
+        cost = self.costs_of(line, states, rows, branches.with_full_braking(len(rows)))
         costs, of_braking = cost[branch], cost[len(branches.choice) :, np.newaxis]
         progress = 1.0 - self._current_progress_remaining
         costs += recipe.caution * progress * np.maximum(costs - of_braking, 0.0)
         return rows, tried_choices, costs
 
-    def costs_of(self, states: State, rows: Ints, branches: ChoiceBranches) -> Floats:
+    def costs_of(self, line: Line, states: State, rows: Ints, branches: ChoiceBranches) -> Floats:
         """Cost of each branch, [M]: minus the return of the learner whose choice is tried.
 
         ``rows`` [B]: indices of the decisions among all visited ones.
         """
-        chooser, learners = self.policy, self.learners
+        chooser, learners = self.policy, line.learners
         world, learner = np.divmod(rows[branches.decision], learners)
 
         def decide(now: Moment) -> Floats:
@@ -166,5 +168,5 @@ class RolloutClassificationModel(BranchingModel):
             choices[held * learners + learner[branch]] = branches.choice[branch]
             return chooser.actions[choices].astype(np.float64).reshape(now.seen.shape[:2])
 
-        gained, _ = play_on(self.game, states.take(world), decide, self.recipe.gamma, at_least=max(self.recipe.holds))
+        gained, _ = play_on(line.game, states.take(world), decide, self.recipe.gamma, at_least=max(self.recipe.holds))
         return -gained[np.arange(len(world)), learner]

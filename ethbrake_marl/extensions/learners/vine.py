@@ -6,15 +6,18 @@ The name is from Schulman et al. 2015 (TRPO), who sample branches from visited s
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
-from ethbrake_marl.extensions.learners.model import BranchingModel
+from ethbrake_marl.extensions.learners.model import BranchingModel, Line, Visited
 from ethbrake_marl.extensions.learners.networks import AveragedNetwork, draw_rows, linear_layers, perceptron
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
 from ethbrake_marl.motion.layout import Floats, Ints
@@ -22,18 +25,30 @@ from ethbrake_marl.policies.layers import Float32s
 
 
 class ClippedActor(AveragedNetwork):
-    """A deterministic policy: the network's output, clipped to [-1, 1]."""
+    """A deterministic policy: the network's output, clipped to [-1, 1].
 
-    def __init__(self, inputs: int, recipe: VineRecipe) -> None:
+    ``features``: names of the observed features. Raises ``InvalidInput`` if they lack the one that the recipe's key
+    ``network.initial_action`` names.
+    """
+
+    def __init__(self, features: Sequence[str], recipe: VineRecipe) -> None:
         shape = recipe.network
-        average = perceptron(inputs, 1, shape.policy, shape.activation)
+        average = perceptron(len(features), 1, shape.policy, shape.activation)
         *hidden, last = linear_layers(average)
         for layer in hidden:
             nn.init.orthogonal_(layer.weight, math.sqrt(2.0))
             nn.init.zeros_(layer.bias)
-        nn.init.orthogonal_(last.weight, 0.01)
-        nn.init.constant_(last.bias, shape.initial_action or 0.0)
-        learning = perceptron(inputs, 1, shape.policy, shape.activation)
+        if isinstance(shape.initial_action, str):
+            if shape.initial_action not in features:
+                raise InvalidInput(
+                    f"recipe {recipe.name!r}: the observation lacks the feature {shape.initial_action}, which"
+                    " network.initial_action names; add it to the observation"
+                )
+            pass_through(hidden, last, features.index(shape.initial_action))
+        else:
+            nn.init.orthogonal_(last.weight, 0.01)
+            nn.init.constant_(last.bias, shape.initial_action or 0.0)
+        learning = perceptron(len(features), 1, shape.policy, shape.activation)
         super().__init__(average, learning, recipe.learning_rate.at(1.0))
 
     @torch.no_grad()
@@ -44,6 +59,23 @@ class ClippedActor(AveragedNetwork):
 
     def act(self, observations: Float32s) -> Float32s:
         return np.clip(self.means(observations), -1.0, 1.0)
+
+
+@torch.no_grad()
+def pass_through(hidden: Sequence[nn.Linear], last: nn.Linear, column: int) -> None:
+    """Set weights of a relu network so that its output is exactly the input x in this ``column``.
+
+    The first two units of every hidden layer are max(x, 0) and max(-x, 0), and the output is their difference. The
+    weights of the other hidden units stay, but those of the output for these units are 0.
+    """
+    first, *between = hidden
+    first.weight[:2] = 0.0
+    first.weight[:2, column] = torch.tensor([1.0, -1.0])
+    for layer in between:
+        layer.weight[:2] = torch.eye(2, layer.in_features)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    last.weight[0, :2] = torch.tensor([1.0, -1.0])
 
 
 class Branches(NamedTuple):
@@ -71,30 +103,32 @@ class VineModel(BranchingModel):
     recipe: VineRecipe
 
     def new_policy(self) -> nn.Module:
-        return ClippedActor(len(self.features), self.recipe)
+        return ClippedActor(self.features, self.recipe)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
 
-    def improve(self, observations: Any, states: Any) -> None:
-        self.train_actor(self.try_out(observations, states))
+    def improve(self, visited: Any) -> None:
+        results = [self.try_out(decisions) for decisions in visited]
+        self.train_actor(TrialResults(*(torch.cat(parts) for parts in zip(*results, strict=True))))
 
-    def try_out(self, observations: Float32s, states: State) -> TrialResults:
+    def try_out(self, visited: Visited) -> TrialResults:
         """Results at random visited decisions, simulated with a higher and with a lower action than the policy's."""
-        branches = self.draw_branches(np.flatnonzero(moving(states).repeat(self.learners)))
-        gained, moved = self.play(states, branches)
-        sample = observations[branches.decisions(self.learners)]
-        gradient = self.measured_gradient(torch.from_numpy(gained), torch.from_numpy(moved))
+        line, observations, states = visited
+        branches = self.draw_branches(line, np.flatnonzero(moving(states).repeat(line.learners)))
+        gained, moved = self.play(line.game, states, branches)
+        sample = observations[branches.decisions(line.learners)]
+        gradient = self.measured_gradient(torch.from_numpy(gained / line.cost), torch.from_numpy(moved))
         return TrialResults(torch.from_numpy(sample), torch.from_numpy(self.policy.means(sample)), gradient)
 
-    def draw_branches(self, decisions: Ints) -> Branches:
-        rows, offset = draw_rows(decisions, self.recipe.tried), self.recipe.offset
+    def draw_branches(self, line: Line, decisions: Ints) -> Branches:
+        rows, offset = draw_rows(decisions, line.tried), self.recipe.offset
         ratio = offset.largest / offset.smallest
         sizes: Floats = offset.smallest * ratio ** torch.rand(len(rows), dtype=torch.float64).numpy()
-        world, learner = np.divmod(np.tile(rows, 2), self.learners)
+        world, learner = np.divmod(np.tile(rows, 2), line.learners)
         return Branches(world, learner, np.concatenate([sizes, -sizes]), np.tile(self.drawn_steps(len(rows)), 2))
 
-    def play(self, states: State, branches: Branches) -> tuple[Floats, Floats]:
+    def play(self, game: Game, states: State, branches: Branches) -> tuple[Floats, Floats]:
         """Discounted return of each branch's learner, and how far its actions were moved, [2B] each.
 
         An action stays in [-1, 1], so it may move by less than ``size``. Moves are summed over the steps.
@@ -112,7 +146,7 @@ class VineModel(BranchingModel):
             moved[row] += after - before
             return actions
 
-        gained, _ = play_on(self.game, states.take(world), decide, self.recipe.gamma, at_least=longest)
+        gained, _ = play_on(game, states.take(world), decide, self.recipe.gamma, at_least=longest)
         return gained[np.arange(len(size)), learner], moved
 
     def measured_gradient(self, gained: Tensor, moved: Tensor) -> Tensor:
@@ -124,7 +158,7 @@ class VineModel(BranchingModel):
         measured = (up - down) / (higher - lower)
         gradient = measured.clamp(-self.recipe.gradient_limit, self.recipe.gradient_limit)
         total = float(measured.abs().sum())
-        self.logger.record("train/gradient_cut", 1.0 - float(gradient.abs().sum()) / total if total else 0.0)
+        self.logger.record_mean("train/gradient_cut", 1.0 - float(gradient.abs().sum()) / total if total else 0.0)
         return gradient.float()
 
     def train_actor(self, results: TrialResults) -> None:

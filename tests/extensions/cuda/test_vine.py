@@ -56,11 +56,11 @@ def test_decisions_and_gradients__are_those_of_the_processor(scenario: Any) -> N
     """Up to the rounding of actions, which are single precision here: the kink at an impact can move a few."""
     cpu, twin = both(SMALL, scenario)
     for _ in range(3):
-        (seen, states), (here, _) = cpu.collect(NOTHING), twin.collect(NOTHING)
-        np.testing.assert_array_equal(seen, here.numpy())
+        (visited,), here = cpu.collect(NOTHING), twin.collect(NOTHING)
+        np.testing.assert_array_equal(visited.observations, here.numpy())
         assert cpu.num_timesteps == twin.num_timesteps
         torch.manual_seed(5)
-        expected = cpu.try_out(seen, states)
+        expected = cpu.try_out(visited)
         torch.manual_seed(5)
         tried = twin.measure(here)
         assert torch.equal(tried.seen, expected.seen) and torch.equal(tried.mean, expected.mean)
@@ -80,10 +80,10 @@ def test_returns__are_those_of_the_processor_to_the_last_bit(scenario: Any, rewa
         torch.nn.init.zeros_(model.policy.learning[-1].weight)
         torch.nn.init.constant_(model.policy.learning[-1].bias, -0.5)
     for _ in range(3):
-        (_, states), _ = cpu.collect(NOTHING), twin.collect(NOTHING)
+        (visited,), _ = cpu.collect(NOTHING), twin.collect(NOTHING)
         world, size = np.arange(192), np.tile([0.125, -0.25, 0.75, -0.75], 48)
-        branches = Branches(world, world % cpu.learners, size, np.tile([1, 2, 4], 64))
-        gained, moved = cpu.play(states, branches)
+        branches = Branches(world, world % visited.line.learners, size, np.tile([1, 2, 4], 64))
+        gained, moved = cpu.play(visited.line.game, visited.states, branches)
         with torch.no_grad():
             here = twin.played(*(torch.from_numpy(column) for column in branches))
         twin.branches.check()
@@ -96,7 +96,7 @@ def test_update__moves_the_weights_as_on_the_processor() -> None:
     cpu, twin = both(SMALL, PAPER)
     for model in (cpu, twin):
         torch.manual_seed(5)
-        model.improve(*model.collect(NOTHING))
+        model.improve(model.collect(NOTHING))
     for mine, other in zip(cpu.policy.parameters(), twin.policy.parameters(), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-6)
     assert cpu.policy.optimizer.param_groups[0]["lr"] == twin.policy.optimizer.param_groups[0]["lr"]
@@ -162,9 +162,9 @@ class NoWaiting(TorchDispatchMode):
 @pytest.mark.slow
 def test_graphs__contain_nothing_that_waits_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     _, twin = both(SMALL, PAPER)
-    seen, _ = twin.collect(NOTHING)
+    seen = twin.collect(NOTHING)
     monkeypatch.setattr(twin.policy.optimizer, "step", lambda: None)  # Adam's own, which a GPU captures
-    given = (torch.from_numpy(column) for column in twin.draw_branches(np.arange(len(seen))))
+    given = (torch.from_numpy(column) for column in twin.draw_branches(twin.lines[0], np.arange(len(seen))))
     with NoWaiting():
         with torch.no_grad():
             twin.played(*given)

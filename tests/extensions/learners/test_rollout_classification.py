@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from ethbrake_marl.episode.objectives import amounts, objectives_of
+from ethbrake_marl.extensions.learners.model import Visited
 from tests.extensions.learners.tiny import PAPER, ROLLOUTS, new_model
 
 
@@ -20,7 +21,7 @@ def test_costs__are_those_of_the_moved_learner_in_episodes_driven_so(objective: 
     model = new_model(ROLLOUTS.replace(**settings, tried=rows, caution=0.0), line)
     start, seen, each = model.rows.episode.take(np.arange(8)), model._last_obs, np.arange(rows)
     torch.manual_seed(5)
-    found, tried, costs = model.try_choices(seen, start)
+    found, tried, costs = model.try_choices(Visited(model.lines[0], seen, start))
     assert sorted(found) == [*range(rows)] and (tried[:, :2] == [0, 4]).all() and len(set(tried[:, 2])) > 1
     world, moved = np.divmod(found, len(learners))
     for way in range(3):
@@ -29,13 +30,13 @@ def test_costs__are_those_of_the_moved_learner_in_episodes_driven_so(objective: 
             action = np.full((rows, len(learners)), -1.0)
             if step < 3:
                 action[each, moved] += 0.5 * tried[:, way]
-            now, _ = model.game.step(now, action)
+            now, _ = model.lines[0].game.step(now, action)
         harm = amounts(objectives_of(objective, 3), None, now, "total")[each, moved + 1]
         np.testing.assert_allclose(costs[:, way], harm, rtol=1e-12, atol=1e-12)
     model.recipe = model.recipe.replace(caution=2.0)  # what goes beyond full braking, here the policy
     model._update_current_progress_remaining(1, 2)  # half of it by now
     torch.manual_seed(5)
-    cautious, beyond = model.try_choices(seen, start)[2], np.maximum(costs - costs[:, :1], 0.0)
+    cautious, beyond = model.try_choices(Visited(model.lines[0], seen, start))[2], np.maximum(costs - costs[:, :1], 0.0)
     assert beyond.max() > 0.1
     np.testing.assert_allclose(cautious, costs + beyond, rtol=1e-12, atol=1e-12)
 
