@@ -5,11 +5,13 @@ from __future__ import annotations
 from operator import not_
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 
 from ethbrake_marl.agents.trained import make_trained
+from ethbrake_marl.episode.features import feature_named, listed_features
 from ethbrake_marl.episode.layer import MESSAGES
-from ethbrake_marl.files.model import FileModel, NonNegative, Positive, refuse
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.model import FileModel, NonNegative, Positive, refuse, require
 from ethbrake_marl.policies.network import Activation, NetworkSpec
 from ethbrake_marl.registry import Part
 from ethbrake_marl.training.recipe import ACTOR_LAYERS, BATCH_SIZE, NETWORK, LayerSizes, Rate, TrainingRecipe
@@ -18,6 +20,10 @@ MOST_STORED_DECISIONS = 2**22  # of one update whose states fit into memory
 
 Text = Annotated[str, Field(max_length=4096)]
 Action = Annotated[float, Field(ge=-1.0, le=1.0)]
+ActionOrFeature = Annotated[
+    Annotated[Action, Tag("#number")] | Annotated[str, Field(max_length=64), Tag("#feature")],
+    Discriminator(lambda value: "#feature" if isinstance(value, str) else "#number"),
+]
 Steps = Annotated[tuple[Annotated[int, Field(ge=1, le=1000)], ...], Field(strict=False, min_length=1, max_length=16)]
 
 
@@ -65,9 +71,31 @@ class BranchingRecipe(TrainingRecipe):
 class ActorShape(FileModel):
     policy: LayerSizes = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"
-    initial_action: Annotated[Action | None, Field(exclude_if=lambda action: action is None)] = Field(
-        None, description="approximate action of the untrained network, -1 to 1; left out: 0, which coasts"
+    initial_action: Annotated[ActionOrFeature | None, Field(exclude_if=lambda action: action is None)] = Field(
+        None,
+        description="action of the untrained network: approximately a number from -1 to 1, or exactly an observed"
+        " feature such as plan.action; left out: 0, which coasts",
     )
+
+    @field_validator("initial_action")
+    @classmethod
+    def _is_an_action(cls, value: float | str | None) -> float | str | None:
+        if isinstance(value, str):
+            try:
+                features = [feature_named(name) for name in listed_features([value])]
+            except InvalidInput as error:
+                raise ValueError(str(error)) from None
+            if not all(feature.scale == 1.0 and -1.0 <= feature.low <= feature.high <= 1.0 for feature in features):
+                raise ValueError("must be one feature with scale 1 and a range inside [-1, 1], such as plan.action")
+        return value
+
+    @model_validator(mode="after")
+    def _network_can_begin_as_a_feature(self) -> Self:
+        if isinstance(self.initial_action, str):
+            right = f"for the network to begin as {self.initial_action}"
+            require(self.activation == "relu", ("activation",), self.activation, f"must be relu {right}")
+            require(min(self.policy) >= 2, ("policy",), list(self.policy), f"needs 2 units in every layer {right}")
+        return self
 
 
 class VineRecipe(BranchingRecipe):

@@ -6,6 +6,7 @@ The name is from Schulman et al. 2015 (TRPO), who sample branches from visited s
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
 from ethbrake_marl.extensions.learners.model import BranchingModel
 from ethbrake_marl.extensions.learners.networks import AveragedNetwork, draw_rows, linear_layers, perceptron
@@ -22,18 +24,30 @@ from ethbrake_marl.policies.layers import Float32s
 
 
 class ClippedActor(AveragedNetwork):
-    """A deterministic policy: the network's output, clipped to [-1, 1]."""
+    """A deterministic policy: the network's output, clipped to [-1, 1].
 
-    def __init__(self, inputs: int, recipe: VineRecipe) -> None:
+    ``features``: names of the observed features. Raises ``InvalidInput`` if they lack the one that the recipe's key
+    ``network.initial_action`` names.
+    """
+
+    def __init__(self, features: Sequence[str], recipe: VineRecipe) -> None:
         shape = recipe.network
-        average = perceptron(inputs, 1, shape.policy, shape.activation)
+        average = perceptron(len(features), 1, shape.policy, shape.activation)
         *hidden, last = linear_layers(average)
         for layer in hidden:
             nn.init.orthogonal_(layer.weight, math.sqrt(2.0))
             nn.init.zeros_(layer.bias)
-        nn.init.orthogonal_(last.weight, 0.01)
-        nn.init.constant_(last.bias, shape.initial_action or 0.0)
-        learning = perceptron(inputs, 1, shape.policy, shape.activation)
+        if isinstance(shape.initial_action, str):
+            if shape.initial_action not in features:
+                raise InvalidInput(
+                    f"recipe {recipe.name!r}: the observation lacks the feature {shape.initial_action}, which"
+                    " network.initial_action names; add it to the observation"
+                )
+            pass_through(hidden, last, features.index(shape.initial_action))
+        else:
+            nn.init.orthogonal_(last.weight, 0.01)
+            nn.init.constant_(last.bias, shape.initial_action or 0.0)
+        learning = perceptron(len(features), 1, shape.policy, shape.activation)
         super().__init__(average, learning, recipe.learning_rate.at(1.0))
 
     @torch.no_grad()
@@ -44,6 +58,23 @@ class ClippedActor(AveragedNetwork):
 
     def act(self, observations: Float32s) -> Float32s:
         return np.clip(self.means(observations), -1.0, 1.0)
+
+
+@torch.no_grad()
+def pass_through(hidden: Sequence[nn.Linear], last: nn.Linear, column: int) -> None:
+    """Set weights of a relu network so that its output is exactly the input x in this ``column``.
+
+    The first two units of every hidden layer are max(x, 0) and max(-x, 0), and the output is their difference. The
+    weights of the other hidden units stay, but those of the output for these units are 0.
+    """
+    first, *between = hidden
+    first.weight[:2] = 0.0
+    first.weight[:2, column] = torch.tensor([1.0, -1.0])
+    for layer in between:
+        layer.weight[:2] = torch.eye(2, layer.in_features)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    last.weight[0, :2] = torch.tensor([1.0, -1.0])
 
 
 class Branches(NamedTuple):
@@ -71,7 +102,7 @@ class VineModel(BranchingModel):
     recipe: VineRecipe
 
     def new_policy(self) -> nn.Module:
-        return ClippedActor(len(self.features), self.recipe)
+        return ClippedActor(self.features, self.recipe)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import ethbrake_marl as eb
+from ethbrake_marl.extensions.learners.networks import linear_layers
 from ethbrake_marl.extensions.learners.start import widen
-from ethbrake_marl.extensions.learners.vine import TrialResults, trusted_targets
+from ethbrake_marl.extensions.learners.vine import ClippedActor, TrialResults, trusted_targets
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.train import train
 from tests.extensions.learners.tiny import PAIR, VINE, new_model
+from tests.refused import refused
 
 SMALL = {name: getattr(VINE, name) for name in ("n_envs", "n_steps", "tried", "batch_size", "evaluation")}
 STILL = load_recipe("vine").replace(**SMALL, learning_rate={"start": 1e-12, "end": 1e-12}, total_steps=1)
@@ -67,6 +70,48 @@ def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> 
     np.testing.assert_allclose(found["old"]["total_harm"], found["new"]["total_harm"], atol=1e-3)
     assert (policy.manifest.algorithm, len(policy.manifest.observation.features)) == ("vine", 57)
     assert eb.make_agent(f"vine@{tmp_path / 'run'}").name == f"vine@{tmp_path / 'run'}"
+
+
+PLAN = VINE.replace(observation=["own", "plan", "role"], network={"policy": [8, 6, 5], "initial_action": "plan.action"})
+
+
+def test_untrained_policy__brakes_as_the_plan_that_it_begins_as(tmp_path: Path) -> None:
+    still = PLAN.replace(learning_rate={"start": 1e-12, "end": 1e-12}, total_steps=1)
+    policy = train(still, "paper-random", tmp_path / "run", measure=None, on_progress=None).policy
+    agents = {"plan": "plan", "policy": eb.LearnedAgent(policy)}
+    results = eb.evaluate("paper-random", agents, episodes=200)
+    assert np.ptp(results["plan"]["honest_cost"]) > 10.0
+    np.testing.assert_allclose(results["policy"]["honest_cost"], results["plan"]["honest_cost"], atol=1e-6)
+
+
+def test_network__begins_as_a_feature_exactly_and_can_learn_from_all_others() -> None:
+    torch.manual_seed(0)
+    actor = ClippedActor(["own.speed", "plan.action", "own.mass"], PLAN)
+    observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    np.testing.assert_array_equal(actor.means(observations), observations[:, 1])
+    actor.descend((actor.learning(torch.from_numpy(observations)) ** 2).mean(), 0.5)
+    assert np.count_nonzero(linear_layers(actor.learning)[-1].weight.detach().numpy()) == 5
+
+
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [
+        ({"initial_action": "plan.actio"}, "initial_action = plan.actio: unknown feature 'plan.actio'; did you mean"),
+        ({"initial_action": "own.speed"}, "initial_action = own.speed: must be one feature with scale 1 and a range"),
+        ({"initial_action": "plan"}, "initial_action = plan: must be one feature with scale 1 and a range inside"),
+        ({"initial_action": -1.5}, "initial_action = -1.5: must be greater than or equal to -1"),
+        ({"activation": "tanh"}, "activation = tanh: must be relu for the network to begin as plan.action"),
+        ({"policy": [8, 1]}, "policy = [8, 1]: needs 2 units in every layer for the network to begin as plan.action"),
+    ],
+)
+def test_network__that_cannot_begin_as_the_feature_is_refused(network: dict[str, Any], message: str) -> None:
+    with refused(f"network.{message}"):
+        PLAN.replace(network={"policy": [8], "initial_action": "plan.action"} | network)
+
+
+def test_network__needs_the_feature_that_it_begins_as() -> None:
+    with refused("recipe 'vine': the observation lacks the feature plan.action, which network.initial_action names"):
+        new_model(PLAN.replace(observation=["own"]))
 
 
 def test_training__for_the_honest_count_selects_by_it(tmp_path: Path) -> None:
