@@ -1,7 +1,7 @@
-"""Results of the training programs in docs/train.md and README with five seeds.
+"""Results of the training programs in docs/train.md with five seeds; the program of README is ``one-honest``.
 
-    python docs/studies/pushing.py one-honest pair-honest readme-honest
-    python docs/studies/pushing.py one pair readme one-bootstrap pair-bootstrap readme-bootstrap one-speed pair-speed
+    python docs/studies/pushing.py one-honest pair-honest
+    python docs/studies/pushing.py one pair one-bootstrap pair-bootstrap one-speed pair-speed
 
 Each argument names a program. ``-honest`` trains for the honest cost, as the pages do, all others for first-impact
 harm: ``-bootstrap`` with ``horizon_is_end=False``, ``-speed`` with a reward term that makes a vehicle stop. A training
@@ -20,10 +20,9 @@ import ethbrake_marl as eb
 from ethbrake_marl.motion.layout import Floats
 
 SHAPED = {"harm": 0.05, "shaping": 0.05, "shaping_discount": 0.99}
-BLOCKS = {  # program -> scenario, parallel worlds, reward
-    "one": ("paper-random", 64, SHAPED),
-    "pair": ("cooperation-3-pair", 32, SHAPED),
-    "readme": ("paper-random", 64, {"harm": 1.0}),
+BLOCKS = {  # program -> scenario, parallel worlds, observation (None: as in the scenario)
+    "one": ("paper-random", 64, ["own", "front_1", "rear_1", "plan"]),
+    "pair": ("cooperation-3-pair", 32, None),
 }
 SEEDS, STEPS = range(5), 200_000
 WORLDS = {"paper-random": 10_000, "cooperation-3-pair": 2_000}
@@ -45,17 +44,17 @@ def speed(before: eb.State, step: eb.Step, after: eb.State) -> Floats:
 def train(block: str, seed: int) -> PPO:
     """Model of a program, trained as on its page, with this seed."""
     name, _, variant = block.partition("-")
-    scenario, worlds, reward = BLOCKS[name]
-    reward = {**reward, "speed": 5e-4} if variant == "speed" else reward
+    scenario, worlds, observation = BLOCKS[name]
+    reward = {**SHAPED, "speed": 5e-4} if variant == "speed" else SHAPED
     reward = {**reward, "harm_count": "honest"} if variant == "honest" else reward
     settings = {"horizon_is_end": False} if variant == "bootstrap" else {}
-    venv = eb.make_sb3_vec_env(scenario, n_envs=worlds, reward=reward, **settings)
+    venv = eb.make_sb3_vec_env(scenario, n_envs=worlds, observation=observation, reward=reward, **settings)
     return PPO("MlpPolicy", venv, n_steps=64, batch_size=512, learning_rate=1e-3, seed=seed).learn(STEPS)
 
 
 def measure(block: str, model: PPO) -> dict[str, float]:
-    agents = {block: eb.policy_agent(model, clip=True)}
     scenario = BLOCKS[block.partition("-")[0]][0]
+    agents = {block: eb.policy_agent(model, clip=True, scenario=scenario)}
     asked = "pushed_m,pushed_mps"
     columns = eb.evaluate(scenario, agents, episodes=WORLDS[scenario], measures=asked)[block]
     values = {name: float(columns[name].mean()) for name, _, _ in MEASURES.values() if name in columns}

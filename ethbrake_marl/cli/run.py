@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.text import Text
@@ -18,8 +18,13 @@ from ethbrake_marl.cli.train import (
     tell_end,
 )
 
+if TYPE_CHECKING:
+    from ethbrake_marl.training.recipe import TrainingRecipe
+    from ethbrake_marl.worlds.scenario import Scenario
+
 QUICKEST = ("quick", "ppo")  # trains the first of these recipes whose algorithm is installed
 QUICKEST_TEAM = ("cooperation", "cooperation-ppo")  # the same for scenarios with several learners
+TESTS_TOGETHER = "mixture-three-tests"  # what the first recipe trains on, for each of the tests that it contains
 
 
 def experiment_command(
@@ -46,10 +51,10 @@ def experiment_command(
 
     Trains a single learner or a team. Writes a run's folder with policies, results, results per world, three figures
     and report.html. If the scenario is one of the three tests (paper-random, paper-random-brake-only,
-    paper-random-obstacle), the policy is also evaluated on the other two. For a team, the report also shows the harm
-    that each vehicle bears, and what each learner adds. All agents minimise the honest cost; with --set rules=paper,
-    first-impact harm, for which pushing is free. Ctrl-C ends the training early and evaluates the policy trained
-    so far; a second Ctrl-C stops at once.
+    paper-random-obstacle), the policy is also evaluated on the other two, and the recipe quick trains on all three
+    together (mixture-three-tests). For a team, the report also shows the harm that each vehicle bears, and what each
+    learner adds. All agents minimise the honest cost; with --set rules=paper, first-impact harm, for which pushing is
+    free. Ctrl-C ends the training early and evaluates the policy trained so far; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_TRAINING) as out:
         from ethbrake_marl.cli.settings import read_settings
@@ -79,6 +84,7 @@ def experiment_command(
             plan,
             chosen,
             folder,
+            train_on=training_scenario(plan, chosen),
             steps=steps,
             seed=seed,
             episodes=episodes,
@@ -92,14 +98,26 @@ def experiment_command(
         objective = trained.training.objective
         single, harm = experiment.learned == POLICY, IN_WORDS[plan.reward.harm_count]
         headline = (
-            f"Trained by recipe {plan.name}, seed {trained.training.recipe.seed}: {trained.steps:,} decisions in"
-            f" {trained.wall_s:.0f} s ({trained.status}). {HYBRID if single else SHIELDED}: the"
+            f"Trained on {trained.training.scenario.name} by recipe {plan.name}, seed {trained.training.recipe.seed}:"
+            f" {trained.steps:,} decisions in {trained.wall_s:.0f} s ({trained.status})."
+            f" {HYBRID if single else SHIELDED}: the"
             f" {experiment.learned}{'' if single else f' (scheme {trained.training.scheme})'} with a shield. All agents"
             f" minimise {harm}{f', except that the {experiment.learned} minimises {objective}' if objective else ''}.\n"
         )
         out.result(experiment.compared.table.to_json(), Text(headline), *tables, in_file=True)
         out.note(where)
         tell_end(out, trained.status, trained.steps, trained.directory)
+
+
+def training_scenario(recipe: TrainingRecipe, scenario: Scenario) -> Scenario:
+    """The mixture of the three tests if the recipe is the first of ``QUICKEST`` and the scenario is one of them."""
+    from ethbrake_marl.worlds.catalogue import load_scenario
+    from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
+
+    mixture = load_scenario(TESTS_TOGETHER)
+    tests = [member.content(without=DESCRIPTIVE_KEYS) for member in mixture.members]
+    is_test = scenario.content(without=DESCRIPTIVE_KEYS) in tests
+    return mixture if recipe.name == QUICKEST[0] and is_test else scenario
 
 
 def quickest(*, several: bool = False) -> str:

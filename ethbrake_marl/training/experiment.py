@@ -75,6 +75,7 @@ def run_experiment(
     scenario: Scenario,
     directory: Path,
     *,
+    train_on: Scenario | None = None,
     steps: int | None = None,
     seed: int | None = None,
     episodes: int = EPISODES,
@@ -86,9 +87,10 @@ def run_experiment(
 ) -> tuple[Experiment, Sequence[Any], str]:
     """Train, compare, and write ``results.json``, ``worlds.csv`` and a report into the run's folder.
 
-    Optimising agents minimise the count of harm used in training (``reward.harm_count``). Ctrl-C stops the training
-    after the current update, and the policy so far is compared; a second Ctrl-C raises ``KeyboardInterrupt``. Other
-    arguments and errors are as in ``train`` and ``evaluate``.
+    ``train_on``: scenario of the training; None: ``scenario``, in which the agents are compared. Optimising agents
+    minimise the count of harm used in training (``reward.harm_count``). Ctrl-C stops the training after the current
+    update, and the policy so far is compared; a second Ctrl-C raises ``KeyboardInterrupt``. Other arguments and errors
+    are as in ``train`` and ``evaluate``.
 
     Returns the experiment, and the tables and text of the report. Raises ``InvalidInput`` at once for a scenario
     without exact impacts, which shields and reports need.
@@ -107,8 +109,9 @@ def run_experiment(
     installed = [name for name in writer.measures if name in MEASURES]
     measures = tuple(usable("measures", installed, lambda name: test_on_list(measures=name), tell))
     trained = train(
-        recipe, scenario, directory, steps=steps, seed=seed, force=force, settings=settings, on_progress=on_progress
-    )
+        recipe, train_on or scenario, directory, steps=steps, seed=seed, force=force, settings=settings,
+        on_progress=on_progress,
+    )  # fmt: skip
     with RunFolder(trained.directory).stage("evaluation", trained.status):
         note = ""
         if trained.status == "interrupted":

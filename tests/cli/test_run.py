@@ -9,8 +9,10 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli.run import quickest
+from ethbrake_marl.cli.run import quickest, training_scenario
 from ethbrake_marl.progress import Progress, ShownProgress
+from ethbrake_marl.training.recipe import load_recipe
+from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.fixtures.commands import Command, Refuse, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
@@ -62,7 +64,9 @@ def test_run__without_extensions_prints_the_tables_and_says_who_learned_what(
     words = ("--scenario", "cooperation-3-pair", "--set", "objective=own", "--set", "scheme=independent", "--seed", "5")
     answer = ethbrake("run", "--recipe", tiny_recipe, *words, "--episodes", "10", "--output", tmp_path / "run")
     text = " ".join(answer.out.split())
-    assert answer.status == 0 and text.startswith("Trained by recipe tiny, seed 5: 256 decisions in ")
+    assert answer.status == 0 and text.startswith(
+        "Trained on cooperation-3-pair by recipe tiny, seed 5: 256 decisions in "
+    )
     assert "shielded team: the trained team (scheme independent) with a shield." in text
     assert "All agents minimise first-impact harm, except that the trained team minimises own." in text
     assert "all but vehicle_3" in text and "Pushed" in text
@@ -75,6 +79,27 @@ def test_run__without_extensions_prints_the_tables_and_says_who_learned_what(
 @pytest.mark.usefixtures("core_alone")
 def test_run__by_default_trains_what_is_installed() -> None:
     assert (quickest(), quickest(several=True)) == ("ppo", "cooperation-ppo")
+
+
+@pytest.mark.parametrize(
+    ("scenario", "recipe", "trained_on"),
+    [
+        ("paper-random", "quick", "mixture-three-tests"),
+        ("paper-random-obstacle", "quick", "mixture-three-tests"),
+        ("paper-random", "ppo", "paper-random"),
+        ("paper-random-buildup", "quick", "paper-random-buildup"),
+    ],
+)
+def test_run__trains_quick_on_all_three_tests_and_anything_else_alone(
+    scenario: str, recipe: str, trained_on: str
+) -> None:
+    chosen = load_recipe("ppo").replace(name=recipe)  # which needs no extension
+    assert training_scenario(chosen, load_scenario(scenario)).name == trained_on
+
+
+def test_run__trains_a_changed_test_alone() -> None:
+    changed = load_scenario("paper-random").replace(mass_t=2.0)
+    assert training_scenario(load_recipe("ppo").replace(name="quick"), changed) == changed
 
 
 def test_run__is_refused(refuse: Refuse) -> None:

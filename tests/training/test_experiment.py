@@ -51,6 +51,15 @@ def test_one_learner__is_compared_alone_and_in_the_hybrid(count: str, tmp_path: 
     assert end["written"] == ["results.json", "worlds.csv"] and end["started_utc"]
 
 
+def test_policy__may_learn_in_another_scenario_than_that_of_the_comparison(tmp_path: Path) -> None:
+    experiment = quick(tmp_path / "run", train_on=eb.load_scenario("paper-random-obstacle"))
+    assert experiment.trained.training.scenario.name == "paper-random-obstacle"
+    assert experiment.compared.scenario.name == "paper-random"
+    again = eb.evaluate("paper-random", f"policy@{tmp_path / 'run'}", episodes=EPISODES)
+    (columns,) = again.columns.values()
+    assert experiment.compared.result["trained policy"]["total_harm"].tolist() == columns["total_harm"].tolist()
+
+
 @pytest.mark.parametrize("scheme", ["independent", "shared"])
 def test_several_learners__are_compared_whole_without_each_and_shielded(scheme: str, tmp_path: Path) -> None:
     run = tmp_path / "run"

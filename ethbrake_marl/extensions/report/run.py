@@ -60,7 +60,7 @@ class RunReport:
         test_results: dict[str, Compared] = {}
         for test in tests:
             begin(f"the same policy in {test.name}")
-            with warnings.catch_warnings():  # the page says that the policy was not trained for this test
+            with warnings.catch_warnings():  # the page says on what the policy was trained
                 warnings.simplefilter("ignore", Unfamiliar)
                 test_results[test.name] = experiment.in_another(
                     test, compared.result.n, TEAM_BASELINES, Tables.measures
@@ -82,22 +82,25 @@ class RunReport:
 def write_figures(experiment: Experiment) -> list[Markup]:
     """Draw the learning curve, harm against the total gap, and one episode. Write them as PNG; return them as HTML."""
     compared, learned, trained = experiment.compared, experiment.learned, experiment.trained
-    recipe, (_, game) = trained.training.recipe, open_game(compared.scenario)
+    training, recipe, (_, game) = trained.training, trained.training.recipe, open_game(compared.scenario)
     typical_row = typical_row_of(compared, learned)
     world, number = compared.worlds([typical_row]), int(compared.result.worlds["world"][typical_row])
     plan = recipe.evaluation
     counts = dict.fromkeys([*HARM, compared.harm_count])
     curves = {**{TITLES[count]: COLUMN[count] for count in counts}, "Share of collisions": "collision_rate"}
     course = (
-        f"{compared.scenario.name}: worlds 0 to {plan.worlds - 1} of the list of seed {plan.seed} at every point;"
-        f" training seed {recipe.seed}. Horizontal lines: {caption(compared.table.parameters)}."
+        f"{training.scenario.name}: worlds 0 to {plan.worlds - 1} of the list of seed {plan.seed} at every point;"
+        f" training seed {recipe.seed}."
     )
-    references = [row for row in compared.table if row.agent in TEAM_BASELINES]
+    references = []
+    if training.scenario == compared.scenario:
+        references = [row for row in compared.table if row.agent in TEAM_BASELINES]
+        course += f" Horizontal lines: {caption(compared.table.parameters)}."
     beside = [agent for agent in compared.teams if agent in (*TEAM_BASELINES, learned)]
     figures = {
         "learning_curve.png": (
             "Learning curve",
-            "Harm and collisions on a fixed list of worlds during the training. The horizontal lines are baselines.",
+            "Harm and collisions on a fixed list of worlds during the training.",
             curves_figure(
                 {
                     title: {learned: {point["steps"]: Estimate(point[key], None) for point in trained.evaluations}}
@@ -157,8 +160,8 @@ def report_page(
     if reward.keys() <= {"harm_count"}:
         reward = {"minus the": IN_WORDS[recipe.reward.harm_count]}
     facts = {
-        "Training": f"{recipe.title or recipe.name}: {trained.steps:,} steps of {recipe.total_steps:,}"
-        f" ({trained.status}), {trained.wall_s:.0f} s",
+        "Training": f"{recipe.title or recipe.name}, on {training.scenario.name}: {trained.steps:,} steps of"
+        f" {recipe.total_steps:,} ({trained.status}), {trained.wall_s:.0f} s",
         "Seeds": f"training {recipe.seed}, evaluation list {compared.result.about['seed']}",
         "Reward": ", ".join(f"{key} {value}" for key, value in reward.items()),
         "Objective": training.objective,
