@@ -66,6 +66,11 @@ def test_table__refuses_rows_of_other_worlds_and_a_task_without_its_scale(tmp_pa
         table.table(table.read_rows([tmp_path / "a.csv"]), "t")
 
 
+def test_table__on_the_page_is_that_of_the_committed_rows() -> None:
+    page = (FOLDER.parents[1] / "docs" / "results" / "benchmark.md").read_text("utf-8")
+    assert table.text_of(table.read_rows(table.ROWS.glob("*.csv"))) in page
+
+
 def test_cross_play__of_two_teams_by_hand() -> None:
     cost = cross_play.cross_play("benchmark-pair", ["full_brake", "constant:5"])
     assert cost.shape == (2, 2, 2000)

@@ -43,7 +43,8 @@ def digest(path: Path) -> str:
     total = hashlib.sha256()
     table = pyarrow.parquet.read_table(path)
     for name in table.column_names:
-        total.update(name.encode() + "\n".join(map(str, table[name].to_pylist())).encode())
+        column = table[name].to_numpy()
+        total.update(name.encode() + ("\n".join(column).encode() if name == "agent" else column.tobytes()))
     return total.hexdigest()
 
 

@@ -98,6 +98,31 @@ def table(cells: Cells, task: str) -> list[list[str]]:
     return [*rows, ["best known (search)", "", "", "", "100.0 %", best, *[""] * len(MEANS)]]
 
 
+def overview(cells: Cells) -> list[list[str]]:
+    """Rows of the first table: the share of each method (row) in each task (column), and the scale."""
+    tasks = tasks_of(cells)
+    methods = list(dict.fromkeys(method for task in tasks for method in methods_of(cells, task)))
+    rows = [["method", *(f"`{task}`" for task in tasks)], ["---", *["---:"] * len(tasks)]]
+    for method in methods:
+        shares = [shares_of(cells, task, method) if (task, method) in cells else None for task in tasks]
+        rows.append([f"`{method}`", *(PERCENT.show(share).in_words for share in shares)])
+    scales = [scale_of(cells, task) for task in tasks]
+    for number, name in enumerate(("full braking, honest cost", "best known, honest cost")):
+        rows.append([name, *(f"{scale[number]:.2f}" for scale in scales)])
+    return rows
+
+
+def tasks_of(cells: Cells) -> list[str]:
+    return sorted({task for task, _ in cells})
+
+
+def text_of(cells: Cells) -> str:
+    """All tables as Markdown: the overview, and one for each task."""
+    tables = {"": overview(cells)} | {f"## {task}\n\n": table(cells, task) for task in tasks_of(cells)}
+    lines = {heading: "\n".join(f"| {' | '.join(row)} |" for row in rows) for heading, rows in tables.items()}
+    return "\n\n".join(f"{heading}{text}" for heading, text in lines.items())
+
+
 @in_our_style
 def draw(cells: Cells, tasks: list[str]) -> Figure:
     """Share of the possible reduction of each method, with its interval over the seeds; a panel for each task."""
@@ -120,11 +145,8 @@ if __name__ == "__main__":
     args = parser.parse_args()
     try:
         cells = read_rows(args.rows or ROWS.glob("*.csv"))
-        tasks = list(dict.fromkeys(task for task, _ in sorted(cells)))
-        for task in tasks:
-            print(f"### {task}\n")
-            print("\n".join(f"| {' | '.join(row)} |" for row in table(cells, task)), end="\n\n")
+        print(text_of(cells))
         if args.figure:
-            write_picture(args.figure, draw(cells, tasks), force=True)
+            write_picture(args.figure, draw(cells, tasks_of(cells)), force=True)
     except (InvalidInput, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
