@@ -23,6 +23,7 @@ PARTS = {
     "shields": {"step": "shields.step:STEP", "episode": "shields.algorithm_1:EPISODE"},
     "terms": {"intervention": "shields.shield:intervention"},
     "measures": {
+        "worst5": "evaluation.worst:WORST5",
         "pushed_mps": "evaluation.pushing:PUSHED_MPS",
         "pushed_m": "evaluation.pushing:PUSHED_M",
         "drove_towards": "evaluation.pushing:DROVE_TOWARDS",

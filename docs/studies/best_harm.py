@@ -3,8 +3,8 @@
 ``python docs/studies/best_harm.py --scenario paper-random --episodes 1000 --output paper-random.npz`` searches a list.
 With ``--output``, finished chunks are saved beside the file, and the same command continues after an interruption.
 ``--merge`` takes the better of several tables in each world, so that searches with other seeds add up.
-``--shipped`` prints proven and best known harm of every shipped table, and the gap between them.
-``--costs`` prints proven and best known honest cost of every shipped table that has both, and their ratio.
+``--shipped`` prints proven and best known harm of every shipped table that has harm, and the gap between them.
+``--costs`` prints proven and best known honest cost of every shipped table that has the cost, and their ratio.
 ``--restamp`` renews the digest of the physics in every shipped table whose harms are still the same, bit for bit.
 """
 
@@ -81,7 +81,7 @@ def main(words: list[str]) -> None:
     if given.shipped:
         if outdated := outdated_tables():
             print(f"left out, because they were made for other physics: {', '.join(outdated)}", file=sys.stderr)
-        sheet = shipped_bounds(shipped_tables())
+        sheet = shipped_bounds(table for table in shipped_tables() if "total" in table.harm)
         heads = [column if isinstance(column, str) else column.heading for column in sheet.columns]
         print(
             "\n".join(

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 GROUP_EPISODES = 2_000  # worlds of each scenario of a group, except the three tests
 REPORT = "report.html"
-FILES = ("results.json", "worlds.csv", "worlds.parquet", REPORT)
+ROWS = "rows.csv"
+FILES = ("results.json", "worlds.csv", "worlds.parquet", ROWS, REPORT)
 
 
 def evaluate_command(
@@ -62,24 +63,29 @@ def evaluate_command(
     is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
     total harm instead of first-impact harm; with --set rules=honest, total harm and a price for pushes, for driving and
     for motion at the horizon. --set measures=pushed_mps,pushed_m adds measures to the
-    results.
+    results. --scenario benchmark evaluates the tasks of the benchmark, for which agents minimise the honest cost.
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.cli.settings import read_settings
+        from ethbrake_marl.evaluation.benchmark import BENCHMARK, COUNT, benchmark_measures
         from ethbrake_marl.worlds.catalogue import THREE_TESTS, group_of_scenarios
 
         chosen = read_settings(settings, of_command=("harm_count", "measures"))
-        _check_outputs(out, output, per_world, report=report)
+        if not isinstance(chosen.command.get("measures", ""), str):
+            raise InvalidInput("--set measures: must be names with commas between them, for instance measures=pushed_m")
         names = group_of_scenarios(scenario)
-        for option, value in (("--per-world", per_world), ("--report", report)):
-            if names and value:
-                raise InvalidInput(
-                    f"{option}: cannot be used with {scenario}, a group of {len(names)} scenarios; name one scenario"
-                )
+        _check_outputs(out, output, names, per_world, report=report)
+        if names and report:
+            raise InvalidInput(
+                f"--report: cannot be used with {scenario}, a group of {len(names)} scenarios; name one scenario"
+            )
         if report and (physics := chosen.change_scenario(scenario).physics) is not None:
             raise InvalidInput(
                 f"--report: records episodes, which needs exact impacts, and physics: {physics} has none; leave it out"
             )
+        if scenario == BENCHMARK:
+            measures = ",".join(filter(None, [chosen.command.get("measures"), *benchmark_measures()]))
+            chosen = chosen._replace(command={"harm_count": COUNT, **chosen.command, "measures": measures})
         comparisons = {}
         for name in names or [scenario]:
             usual = GROUP_EPISODES if names and name not in THREE_TESTS else 10_000
@@ -90,7 +96,7 @@ def evaluate_command(
             output.mkdir(parents=True, exist_ok=True)
             write(output / REPORT, comparisons[scenario], "ethbrake " + " ".join(sys.argv[1:]), force=force)
             out.note(f"report: {output / REPORT}")
-        _show(out, comparisons, output, per_world, REPORT if report else "")
+        _show(out, scenario, comparisons, output, per_world, REPORT if report else "")
 
 
 def _compare(
@@ -100,8 +106,6 @@ def _compare(
     from ethbrake_marl.names import teams_of
 
     harm_count, measures = chosen.command.get("harm_count", "first"), chosen.command.get("measures", "")
-    if not isinstance(measures, str):
-        raise InvalidInput("--set measures: must be names with commas between them, for instance measures=pushed_m")
     loaded = chosen.change_scenario(scenario)
     return Compared.of(
         loaded, teams_of(agents, loaded, harm_count=harm_count), episodes=episodes, seed=seed, harm_count=harm_count,
@@ -109,33 +113,47 @@ def _compare(
     )  # fmt: skip
 
 
-def _show(out: Out, comparisons: dict[str, Compared], output: Path | None, per_world: Any, page: str) -> None:
+def _show(
+    out: Out, scenario: str, comparisons: dict[str, Compared], output: Path | None, per_world: Any, page: str
+) -> None:
     """Write the results to the folder ``output``, if there is one, and print them."""
+    from ethbrake_marl.evaluation.benchmark import BENCHMARK, benchmark_rows, benchmark_sheet
     from ethbrake_marl.evaluation.results import write_results
     from ethbrake_marl.evaluation.summary import summarise_lists
+    from ethbrake_marl.files.sheet import csv_text
+    from ethbrake_marl.files.store import write_output
 
     tables = {name: comparison.table for name, comparison in comparisons.items()}
     results = {name: comparison.result for name, comparison in comparisons.items()}
     if output is not None:
-        output.mkdir(parents=True, exist_ok=True)
-        for name in {*FILES} - {page}:
-            (output / name).unlink(missing_ok=True)
         for name, table in tables.items():
             place = output / name if len(tables) > 1 else output
+            place.mkdir(parents=True, exist_ok=True)
+            for file in {*FILES} - {page}:
+                (place / file).unlink(missing_ok=True)
             for path in write_results(place, table, results[name], per_world, force=out.force):
                 out.note(f"results: {path}")
-    if len(tables) > 1:
+    if scenario == BENCHMARK:
+        rows, sheet = benchmark_rows(tables), benchmark_sheet(tables)
+        if output is not None:
+            write_output(output / ROWS, csv_text(rows).encode(), force=out.force)
+            out.note(f"rows: {output / ROWS}")
+    elif len(tables) > 1:
         sheet = summarise_lists(tables, results)
         scenarios = (name for name, table in tables.items() for _ in table)
         rows = [{"scenario": name, **row} for name, row in zip(scenarios, sheet.json(), strict=True)]
-        out.result(rows, sheet, in_file=output is not None)
+    else:
+        (table,) = tables.values()
+        out.result(table.to_json(), *table.tables(), in_file=output is not None)
         return
-    (table,) = tables.values()
-    out.result(table.to_json(), *table.tables(), in_file=output is not None)
+    out.result(rows, sheet, in_file=output is not None)
 
 
-def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
-    """Raise an error, before any work, if the result's files cannot be written or an option lacks a folder."""
+def _check_outputs(out: Out, output: Path | None, names: list[str], per_world: str | None, *, report: bool) -> None:
+    """Raise an error, before any work, if the result's files cannot be written or an option lacks a folder.
+
+    ``names``: scenarios of the group, each with a folder in ``output``; [] for a single scenario.
+    """
     if output is None:
         for option, value in (("--per-world", per_world), ("--report", report)):
             if value:
@@ -143,4 +161,5 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
         return
     if per_world == "parquet":
         need("pyarrow")
-    check_folder(output, FILES, force=out.force)
+    for folder in (output, *(output / name for name in names)):
+        check_folder(folder, FILES, force=out.force)

@@ -66,12 +66,12 @@ class Watch(Protocol):
 class Statistic(NamedTuple):
     """Statistic of a measure's column, for tables and JSON.
 
-    The kind ``rate`` is the share of worlds in which the column is true, ``difference`` the mean difference from the
-    baseline, ``decrease`` 1 - (mean) / (mean of the baseline).
+    The kind ``rate`` is the share of worlds in which the column is true, ``worst`` the mean of its largest 5 %,
+    ``difference`` the mean difference from the baseline, ``decrease`` 1 - (mean) / (mean of the baseline).
     """
 
     key: str  # name in JSON
-    kind: Literal["mean", "rate", "difference", "decrease"] = "mean"
+    kind: Literal["mean", "worst", "rate", "difference", "decrease"] = "mean"
     heading: str = ""  # in tables; "": left out of tables
     short: str = ""  # heading in a terminal
     ending: str = ""  # what follows the measure's name in the column's name

@@ -34,6 +34,7 @@ from scipy.special import ndtri, stdtrit
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.motion.layout import Bools, Floats
 
+WORST = 0.05  # share of the worlds in ``worst``
 UPPER = 0.975  # quantile at the upper end of a 95 % interval
 Z = float(ndtri(UPPER))
 LEAST_REST = 1e-6  # of the weight, outside each recording: nothing can be said of others without it
@@ -52,6 +53,18 @@ def mean(values: Floats, clusters: Clusters = None) -> Estimate:
         return estimate
     interval = (max(estimate.interval[0], 0.0), estimate.interval[1]) if values.any() else None
     return Estimate(estimate.value, interval, estimate.error, estimate.freedom)
+
+
+def worst(values: Floats, clusters: Clusters = None) -> Estimate:
+    """Mean of the largest 5 % of the values (conditional value at risk), with its interval.
+
+    With the 95 % quantile q of the values it is the mean of ``q + max(value - q, 0) / 0.05`` (Rockafellar and Uryasev
+    2000), and has the t interval of this mean. If no value lies above q, there is no interval.
+    """
+    quantile = float(np.quantile(values, 1.0 - WORST, method="inverted_cdf"))
+    if not (values > quantile).any():
+        return Estimate(quantile, None)
+    return mean(quantile + np.maximum(values - quantile, 0.0) / WORST, clusters)
 
 
 def difference(values: Floats, baseline: Floats, clusters: Clusters = None) -> Estimate:

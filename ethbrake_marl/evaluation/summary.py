@@ -249,6 +249,8 @@ def _estimate(
     if statistic.kind == "rate":
         return statistics.rate(values, clusters)
     numbers = values.astype(np.float64, copy=False)
+    if statistic.kind == "worst":
+        return statistics.worst(numbers, clusters)
     if statistic.kind == "mean" or baseline is None:
         return statistics.mean(numbers, clusters)
     return COMPARE[statistic.kind](numbers, baseline.astype(np.float64, copy=False), clusters)

@@ -21,10 +21,6 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 FOLDERS: dict[str, Path] = {}  # registered folders: path as text -> path
 
 THREE_TESTS = ("paper-random", "paper-random-brake-only", "paper-random-obstacle")
-BENCHMARK = (  # scenarios that ship with a table of best known harm, which the share of the possible reduction needs
-    *(*THREE_TESTS, "paper-delay-high", "paper-distance"),
-    *("realistic-motorway", "realistic-mixed", "stress-wide", "cooperation-2-blocked", "cooperation-2-five"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +111,7 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
 
 
 def group_of_scenarios(name: str) -> list[str]:
-    """Names of the scenarios in a group: ``benchmark``, or a folder of shipped scenarios; [] for an unknown group."""
-    if name == "benchmark":
-        return list(BENCHMARK)
+    """Names of the scenarios in a group, which is a folder of shipped scenarios; [] for an unknown group."""
     return sorted(path.stem for path in shipped_folder().glob("*/*.yaml") if path.parent.name == name)
 
 

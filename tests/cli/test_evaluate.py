@@ -28,9 +28,9 @@ def test_rules__are_short_for_a_count_and_the_honest_ones_show_cost_and_push(eth
         assert told_json(ethbrake(*arguments, "--json", "--set", f"rules={rules}")) == long
         shown = ethbrake(*arguments, "--set", f"rules={rules}").out
         assert (rules == "honest") == ("Honest Push" in shown) and "First-impact        Total" in shown
-    line = "evaluate --scenario benchmark --episodes 2 --agents coast --set rules=honest"
+    line = "evaluate --scenario stress --episodes 2 --agents coast --set rules=honest"
     group = ethbrake(*line.split())
-    assert "Honest" in group.out and "paper-random-obstacle" in group.out
+    assert "Honest" in group.out and "stress-wide-obstacle" in group.out
 
 
 def test_a_world_by_hand__in_table_and_rows(tmp_path: Path) -> None:
@@ -55,8 +55,50 @@ def test_standards__every_row_names_its_scenario_and_full_braking_passes_as_publ
         passes = row["agent"] == "full_brake"
         assert row["result"] == ("passed" if passes else "failed")
         assert (row["collision_rate"] == row["hardest_impact_kmh"] == row["total_harm"] == 0.0) == passes
-    refused = ethbrake(*words, "--per-world", "csv", "--output", "new")
-    check_refused(refused, "--per-world: cannot be used with standards, a group of 5 scenarios; name one scenario")
+    refused = ethbrake(*words, "--report", "--output", "new")
+    check_refused(refused, "--report: cannot be used with standards, a group of 5 scenarios; name one scenario")
+
+
+def test_group__has_a_folder_of_results_for_each_scenario(ethbrake: Command) -> None:
+    words = ("evaluate", "--scenario", "stress", "--agents", "coast", "--episodes", "3", "--output", "new")
+    assert ethbrake(*words, "--per-world", "csv").status == 0
+    for name in ("stress-wide", "stress-wide-obstacle"):
+        assert len(rows_of(Path("new", name, "worlds.csv"))) == 3
+        assert eb.read_result(f"new/{name}/results.json")["coast"]["parameters"]["scenario"] == name
+    check_refused(ethbrake(*words), "already exists")
+    assert ethbrake(*words, "--force").status == 0
+    assert not Path("new/stress-wide/worlds.csv").exists()
+
+
+MINE = """
+import ethbrake_marl as eb
+
+
+def make_agent(argument, settings):
+    return eb.make_agent("constant:5")
+"""
+
+
+def test_benchmark__prints_a_row_for_each_task_and_writes_it(ethbrake: Command) -> None:
+    Path("mine.py").write_text(MINE)
+    words = ("evaluate", "--scenario", "benchmark", "--episodes", "40", "--output", "new")
+    agents = "full_brake,e_v2x_bm,mine.py:make_agent"
+    printed = told_json(ethbrake(*words, "--agents", agents, "--json"))
+    written = rows_of(Path("new/rows.csv"))
+    names = [(row["task"], row["agent"]) for row in written]
+    assert names == [(row["task"], row["agent"]) for row in printed] and len({*names}) == 7 * 3
+    for text, row in zip(written, printed, strict=True):
+        result = eb.read_result(f"new/{row['task']}/results.json")[row["agent"]]
+        for key in ("honest_cost", "worst5_honest", "maximin_honest", "pushed_mps", "collision_rate"):
+            assert float(text[key]) == row[key] == result[key]
+        assert text["worlds_sha256"] == result["worlds_sha256"] and row["version"] == eb.__version__
+        assert row["share_of_possible_reduction_honest"] == 0.0 or row["agent"] != "full_brake"
+    chosen = [row["honest_cost"] for row in printed if row["agent"] == "e_v2x_bm"]
+    again = told_json(ethbrake("evaluate", "--scenario", "benchmark-all", "--episodes", "40", "--agents", "e_v2x_bm",
+                               "--set", "rules=honest", "--json"))  # fmt: skip
+    assert again[0]["honest_cost"] == chosen[0]  # by default agents minimise the honest cost
+    shown = ethbrake(*words, "--agents", "coast", "--force").out
+    assert "benchmark-truck" in shown and "Possible" in shown
 
 
 TEAM = """

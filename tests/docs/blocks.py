@@ -66,7 +66,7 @@ SHORT = {  # what is added to a command, the first that fits: the last value of 
     "ethbrake study front": "--episodes 2 --steps 1 --budget 20",
     "ethbrake study falsify": "--budget 20",
     "python train/ippo.py": "--steps 200 --copies 2 --rollout 60",
-    "python train/sweep.py": "--seeds 1 --jobs 1 --set total_steps=1 evaluation.worlds=10",
+    "python train/benchmark/run.py": "--seeds 1 --jobs 1 --decisions 100 --episodes 5",
     "python train/tune.py": "--trials 1 --jobs 1 --set total_steps=1 evaluation.worlds=10",
     "python docs/studies/best_harm.py": "--episodes 2 --budget 20",
 }

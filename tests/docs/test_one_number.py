@@ -21,7 +21,9 @@ AGENTS = {
 CHOOSE = ("e_v2x_bm", "best_harm")  # what they do depends on what they minimise
 COUNT = re.compile(r"(?i)(first)-impact|(total)|(honest)")
 LEAST = re.compile(r"(?:minimises?|harm_count=|rules=)\W*(?:the )?\W*(first|total|honest)")
-TEST = re.compile(r"(?i)(main|obstacle|brake-only) test|((?:paper|cooperation|realistic|stress|recorded)-[\w-]+|rainy)")
+TEST = re.compile(
+    r"(?i)(main|obstacle|brake-only) test|((?:paper|cooperation|realistic|stress|recorded|benchmark)-[\w-]+|rainy)"
+)
 NAMES = {"main": "paper-random", "obstacle": "paper-random-obstacle", "brake-only": "paper-random-brake-only"}
 Fact = tuple[tuple[str | None, ...], str]  # (agent, test, count, what it minimises), and the number as it is shown
 
@@ -134,7 +136,8 @@ def test_evaluations__drive_the_whole_list() -> None:
     for page in TEXTS:
         for command in re.findall(r"(?m)^(?:\$ )?(ethbrake evaluate (?:.*\\\n)*.*)", page.read_text("utf-8")):
             [scenario] = re.findall(r"--scenario (\S+)", command) or ["paper-random"]
-            number = [*re.findall(r"--episodes (\d+)", command), "10000"][0]
+            usual = "2000" if scenario == "benchmark" else "10000"  # of a group whose tasks are no tests
+            number = [*re.findall(r"--episodes (\d+)", command), usual][0]
             whole = "10000" if scenario == "TEST" or scenario in NAMES.values() else "2000"
             if number != whole and ("--episodes" in command or "results" in page.parts) and "robust" not in command:
                 wrong.append((page.name, command))

@@ -17,6 +17,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm import EV2XBM
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.team import Team
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.terms import TERMS, register_term
@@ -65,6 +66,14 @@ def test_objectives__are_measured_in_every_count_and_once_unless_vehicles_differ
     assert "vehicle_2_first_1" not in row and "pushed_mps" in row
     coasts = result["coast"]
     assert coasts["vehicle_2_honest"] == coasts["honest_cost_2"] > coasts["vehicle_2_total"]
+
+
+def test_worst5__is_the_mean_of_the_worst_worlds_in_every_count() -> None:
+    result = eb.evaluate("paper-random", "full_brake", episodes=40, measures="worst5", harm_count="honest")
+    (row,) = eb.summarise(result)
+    for count, column in COLUMN.items():
+        last_two = np.sort(result["full_brake"][column])[-2:]
+        assert row[f"worst5_{count}"].value == pytest.approx(last_two.mean()) and row[f"worst5_{count}"].interval
 
 
 def test_pushing__is_where_vehicle_1_ends_minus_where_it_would() -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, strategies as st
 from scipy import stats
 
-from ethbrake_marl.evaluation.statistics import decrease, difference, mean, rate, unpaired_difference, wilson
+from ethbrake_marl.evaluation.statistics import decrease, difference, mean, rate, unpaired_difference, wilson, worst
 from ethbrake_marl.files.sheet import Estimate
 
 T_2 = 4.302652729911275  # quantile of Student's t with 2 degrees of freedom at 97.5 %
@@ -30,6 +30,30 @@ def test_mean_of_amounts__does_not_go_below_zero_and_of_zeros_is_not_known() -> 
     assert mean(np.zeros(9)).interval is None
     assert difference(np.zeros(9), np.zeros(9)).interval == (0.0, 0.0)
     assert mean(np.array([2.0])) == Estimate(2.0, None)
+
+
+def test_worst_by_hand() -> None:
+    # of 1 ... 40 the largest 5 % are 39 and 40; over the quantile 38: 38 + 1 / 0.05 = 58, 38 + 2 / 0.05 = 78, 38 x 38
+    found = worst(np.arange(40.0, 0.0, -1.0))
+    by_hand = mean(np.array([38.0] * 38 + [58.0, 78.0]))
+    assert found.value == 39.5 == pytest.approx(by_hand.value) and found.interval == pytest.approx(by_hand.interval)
+    assert worst(np.array([3.0, 9.0])) == Estimate(9.0, None) == worst(np.full(60, 9.0))
+
+
+def test_worst__covers_the_truth() -> None:
+    # of the exponential distribution: 1 + ln(1 / 5 %)
+    rng = np.random.default_rng(0)
+    ends = [worst(rng.exponential(size=2000)).ends for _ in range(1000)]
+    assert 0.93 < np.mean([low <= 1.0 + math.log(20.0) <= high for low, high in ends]) < 0.97
+
+
+def test_worst__by_recording_is_the_mean_of_the_worst_worlds_with_a_longer_interval() -> None:
+    rng = np.random.default_rng(1)
+    recordings = np.repeat(np.arange(20), 50)
+    values = rng.exponential(size=20)[recordings] * rng.exponential(size=1000)
+    alone, alike = worst(values), worst(values, recordings)
+    assert alone.value == pytest.approx(np.sort(values)[-50:].mean()) == pytest.approx(alike.value)
+    assert alone.interval and alike.interval and alike.interval[1] - alike.interval[0] > np.ptp(alone.interval)
 
 
 def test_decrease_by_hand() -> None:

@@ -1,4 +1,4 @@
-"""``train/sweep.py`` and ``train/tune.py``: a killed run goes on to the result of an undisturbed one."""
+"""``train/benchmark/run.py`` and ``train/tune.py``: a killed run goes on to the result of an undisturbed one."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from pathlib import Path
 import pytest
 import yaml
 
+import ethbrake_marl as eb
+from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training.job import Job
 from ethbrake_marl.training.training import Training
+from tests.fixtures.commands import rows_of
 from tests.training.tiny import TINY, kept
 
 pytest.importorskip("optuna")
 Run = Callable[..., int]
 ROOT = Path(__file__).resolve().parents[2]
-SWEEP = ("sweep", "--scenarios", "paper-random", "--seeds", "2", "--recipes")
+RUN = ("benchmark/run", "--tasks", "paper-random", "--seeds", "2", "--episodes", "5", "--methods")
 TUNE = ("tune", "--scenario", "paper-random", "--trials", "3", "--search", "gamma=0.9..1.0:log")
 TUNE += ("n_epochs=1..3", "network.policy=[8]/[16, 8]", "--recipe")
 
@@ -39,7 +42,7 @@ def recipe(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch) -> Run:
     def call(script: str, *words: object) -> int:
-        monkeypatch.setattr(sys, "argv", [f"{script}.py", *map(str, words)])
+        monkeypatch.setattr(sys, "argv", [f"{Path(script).name}.py", *map(str, words)])
         try:
             runpy.run_path(str(ROOT / "train" / f"{script}.py"), run_name="__main__")
         except SystemExit as ended:
@@ -51,11 +54,15 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Run:
 
 def results(folder: Path) -> dict[str, bytes]:
     files = [*folder.glob("*.csv"), *folder.rglob("weights.safetensors")]
-    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+    contents = {str(file.relative_to(folder)): file.read_bytes() for file in files}
+    if "rows.csv" in contents:  # without the processor time
+        rows = [{**row, "cpu_s": ""} for row in rows_of(folder / "rows.csv")]
+        contents["rows.csv"] = csv_text(rows).encode()
+    return contents
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("words", "second"), [(SWEEP, "*-seed1-*"), (TUNE, "trial-1")], ids=["sweep", "tune"])
+@pytest.mark.parametrize(("words", "second"), [(RUN, "runs/*-seed1"), (TUNE, "trial-1")], ids=["run", "tune"])
 def test_killed_run__goes_on_to_the_same_result(
     words: tuple[str, ...], second: str, recipe: str, run: Run, tmp_path: Path
 ) -> None:
@@ -78,18 +85,53 @@ def test_killed_run__goes_on_to_the_same_result(
 
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
-def test_sweep__on_ray_has_the_same_table(recipe: str, run: Run, tmp_path: Path) -> None:
-    script, *options = SWEEP
+def test_run__on_ray_has_the_same_table(recipe: str, run: Run, tmp_path: Path) -> None:
+    script, *options = RUN
     for folder, more in (("here", []), ("ray", ["--ray", "local", "--jobs", "2"])):
         assert run(script, *options, recipe, *more, "--output", tmp_path / folder) == 0
     assert results(tmp_path / "ray") == results(tmp_path / "here")
 
 
+METHOD = """
+from pathlib import Path
+
+import ethbrake_marl as eb
+
+
+def train(task, seed, decisions, folder):
+    (folder / "brake.txt").write_text(str(6 - seed))
+
+
+def make_agent(folder, settings):
+    return eb.make_agent("constant:" + (Path(folder) / "brake.txt").read_text())
+"""
+
+
+def test_run__of_a_method_of_ones_own(run: Run, empty_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("mine.py").write_text(METHOD)
+    words = ("benchmark/run", "--tasks", "benchmark-pair", "--methods", "mine.py:train", "--seeds", "2", "--decisions")
+    assert run(*words, "50", "--episodes", "30", "--output", "new") == 0
+    rows = rows_of(Path("new/rows.csv"))
+    assert [(row["task"], row["method"], row["seed"], row["decisions"]) for row in rows] == [
+        ("benchmark-pair", "mine.py:train", "0", "50"), ("benchmark-pair", "mine.py:train", "1", "50"),
+    ]  # fmt: skip
+    agents = {brake: f"constant:{brake}" for brake in ("6", "5")}
+    result = eb.evaluate("benchmark-pair", agents, episodes=30, measures="worst5")
+    table = {row.agent: row for row in eb.summarise(result)}
+    for row, brake in zip(rows, agents, strict=True):
+        for key in ("honest_cost", "worst5_honest", "collision_rate"):
+            assert float(row[key]) == table[brake][key].value
+        assert float(row["share_of_possible_reduction_honest"]) < 1.0
+    capsys.readouterr()
+    assert run(*words, "60", "--episodes", "30", "--output", "new") == 1
+    assert "has a training with other settings" in capsys.readouterr().out
+
+
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_run__that_fails_is_a_row_with_its_reason(recipe: str, run: Run, tmp_path: Path) -> None:
-    (script, *options), diverging = SWEEP, "reward.harm=1.0e+300"
-    assert run(script, *options, recipe, "--set", diverging, "--output", tmp_path / "sweep") == 1
-    assert (tmp_path / "sweep" / "results.csv").read_text().count("training: ") == 2
+    (script, *options), diverging = RUN, "reward.harm=1.0e+300"
+    assert run(script, *options, recipe, "--set", diverging, "--output", tmp_path / "run") == 1
+    assert (tmp_path / "run" / "rows.csv").read_text().count("training: ") == 2
     assert run(TUNE[0], *TUNE[1:], recipe, "--trials", "1", "--set", diverging, "--output", tmp_path / "tune") == 0
     assert "\n0,,0.9" in (tmp_path / "tune" / "trials.csv").read_text()
 
@@ -97,10 +139,10 @@ def test_run__that_fails_is_a_row_with_its_reason(recipe: str, run: Run, tmp_pat
 @pytest.mark.parametrize(
     ("words", "key"),
     [
-        ((*SWEEP, "ppp"), "'ppo'"),
-        ((*SWEEP, "ppo", "ppo"), "only once"),
-        ((*SWEEP, "ppo", "--set", "gama=1"), "gamma"),
-        ((*SWEEP, "ppo", "--jobs", "0"), "--jobs 0: must be 1 or more"),
+        ((*RUN, "ppp"), "'ppo'"),
+        ((*RUN, "ppo", "ppo"), "only once"),
+        ((*RUN, "ppo", "--set", "gama=1"), "gamma"),
+        ((*RUN, "ppo", "--jobs", "0"), "--jobs 0: must be 1 or more"),
         ((*TUNE, "ppo", "--jobs", "0"), "--jobs and --trials must be 1 or more"),
         ((*TUNE, "ppo", "--search", "gamma=0.9..1", "gamma=0.5/0.6"), "each key only once"),
         ((*TUNE, "ppo", "--search", "gamma=0.9"), "KEY=LOW..HIGH"),
@@ -115,7 +157,7 @@ def test_bad_input__is_refused_in_one_line_and_nothing_is_made(
     script, *options = words
     assert run(script, *options, "--output", tmp_path / "new") == 2 and not (tmp_path / "new").exists()
     told = capsys.readouterr().err
-    assert key in told and told.startswith(f"{script}.py: error: ") and told.count("\n") == 1
+    assert key in told and told.startswith(f"{Path(script).name}.py: error: ") and told.count("\n") == 1
 
 
 def test_tune__a_log_of_other_settings_or_a_damaged_one_is_one_error(

@@ -293,8 +293,13 @@ def test_game__has_the_training_worlds_and_sees_an_obstacle() -> None:
 
 
 def test_catalogue__has_groups() -> None:
-    assert len(list_scenarios()) == 47
-    assert len(group_of_scenarios("benchmark")) == 10
+    assert len(list_scenarios()) == 54
+    tasks = group_of_scenarios("benchmark")
+    assert [task.removeprefix("benchmark-") for task in tasks] == [
+        "all", "blocked", "five", "noisy", "pair", "single", "truck",
+    ]  # fmt: skip
+    learners = {task: load_scenario(task).learners for task in tasks}
+    assert learners["benchmark-five"] == (1, 2, 3, 4, 5) and learners["benchmark-blocked"] == (2, 3)
     assert group_of_scenarios("stress") == ["stress-wide", "stress-wide-obstacle"]
     assert group_of_scenarios("nothing") == []
 

@@ -101,7 +101,7 @@ def sweep_levels(name: str, sweep: str, settings: CommandSettings, recipes: Sequ
     if path[0] not in Scenario.model_fields:
         raise InvalidInput(
             f"--sweep {key}: only a key of a scenario can be swept; to vary a recipe, write a recipe for each value,"
-            " and use train/sweep.py"
+            " and use train/benchmark/run.py"
         )
     if path[0] in SHARED_KEYS:
         raise InvalidInput(

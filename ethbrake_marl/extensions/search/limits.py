@@ -18,15 +18,12 @@ from ethbrake_marl.registry import Part
 def least_known_values(game: Game, alert: State) -> dict[str, Floats]:
     """Least known value of each count of harm in each world, count -> [n] m2/s2, from the shipped tables.
 
-    The honest cost is included only if it is known in all worlds. Raises ``InvalidInput`` if the least harm of a world
-    is in no shipped table.
+    A count is included only if it is known in all worlds. Raises ``InvalidInput`` if no count is.
     """
     problem = problem_of(game, alert)
     least_values = {count: stored(problem, count)[0] for count in COUNTS}
-    least_values = {
-        count: values for count, values in least_values.items() if count in HARM or np.isfinite(values).all()
-    }
-    if any(np.isinf(least_values[count]).any() for count in HARM):
+    least_values = {count: values for count, values in least_values.items() if np.isfinite(values).all()}
+    if not least_values:
         raise InvalidInput(f"measures limits: {_why_unknown(game.name)}; evaluate the agent best_harm beside yours")
     return least_values
 

@@ -134,7 +134,7 @@ def test_limits__under_another_impact_law_are_refused_and_left_out_of_reports(ot
     with refused(f"measures limits: {OUTDATED}"):
         eb.evaluate(PAPER, "coast", episodes=3, measures="limits")
     with refused(NO_TABLE):
-        eb.evaluate("cooperation-3-pair", "coast", episodes=3, measures="limits")
+        eb.evaluate("realistic-platoon", "coast", episodes=3, measures="limits")
     told: list[str] = []
 
     def measured(name: str) -> object:
@@ -145,13 +145,13 @@ def test_limits__under_another_impact_law_are_refused_and_left_out_of_reports(ot
     assert left == ["pushed_m"] and why.startswith("limits is left out: measures limits: ") and OUTDATED in why
 
 
-def drive(scenario: eb.Scenario, agent: str, **options: object) -> Callable[[], object]:
+def drive(scenario: eb.Scenario | str, agent: str, **options: object) -> Callable[[], object]:
     return lambda: eb.evaluate(scenario, agent, episodes=3, **options)
 
 
 PLANS = KEPT.replace(roles={"vehicle_2": "learner", "vehicle_3": "ppo"})
 NO_TABLE = (
-    "measures limits: scenario 'cooperation-3-pair' has no table of best known harm; evaluate the agent best_harm"
+    "measures limits: scenario 'realistic-platoon' has no table of best known harm; evaluate the agent best_harm"
     " beside yours"
 )
 OTHER_WORLDS = (
@@ -166,7 +166,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "'full_brake+step+search': a search around a shield; write +search first": drive(PAPER, "full_brake+step+search"),
     "vehicle_3 is driven by 'ppo', whose commands are not known at the alert": drive(PLANS, "full_brake+search"),
     OTHER_WORLDS: drive(PAPER, "coast", seed=8, measures="limits"),
-    NO_TABLE: drive(eb.load_scenario("cooperation-3-pair"), "coast", measures="limits"),
+    NO_TABLE: drive("realistic-platoon", "coast", measures="limits"),
 }
 
 

@@ -1,0 +1,82 @@
+"""The benchmark: its measures, its table to read, and its rows for a file, one row for each task and team."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ethbrake_marl.evaluation.door import SEED, evaluate
+from ethbrake_marl.evaluation.evaluate import Result
+from ethbrake_marl.evaluation.named_measures import MEASURES
+from ethbrake_marl.evaluation.summary import SummaryTable
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet
+from ethbrake_marl.registry import DISTRIBUTION
+from ethbrake_marl.worlds.catalogue import group_of_scenarios, load_scenario
+from ethbrake_marl.worlds.game import AnyScenario
+
+BENCHMARK = "benchmark"  # group of scenarios, the tasks
+EPISODES = 2_000  # worlds of each task, from the evaluation list of seed ``SEED``
+COUNT = "honest"  # what methods are compared by
+BEST_KNOWN = "limits"  # measure that gives the share of the possible reduction
+PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
+COLUMNS = (
+    Column(
+        "Share of the possible", "share_of_possible_reduction_honest", **PERCENT, short="Possible", interval="below"
+    ),
+    Column("Honest cost", "honest_cost", short="Honest\ncost", interval="below"),
+    Column("Worst 5 %", "worst5_honest", short="Worst\n5 %", interval="below"),
+    Column("Worst-off vehicle", "maximin_honest", short="Worst\noff", interval="hidden"),
+    Column("First-impact harm", "first_impact_harm", short="First\nimpact", interval="hidden"),
+    Column("Total harm", "total_harm", short="Total\nharm", interval="hidden"),
+    Column("Collisions", "collision_rate", **PERCENT, short="Colli-\nsions", interval="hidden"),
+    Column("Push (m/s)", "pushed_mps", short="Push\nm/s", interval="hidden"),
+)
+NOTE = (
+    "Means per world; harm and cost in m²/s². Possible: 0 % for full braking, 100 % for the best known cost; it needs"
+    " the agent full_brake beside yours. Worst 5 %: mean honest cost of the worst 5 % of the worlds. Worst off: honest"
+    " cost that the worst-off vehicle of a world bears."
+)
+
+
+def benchmark_measures() -> list[str]:
+    """Names of the measures of ``COLUMNS`` as far as they are installed, except those of every evaluation."""
+    return ["worst5", "maximin", *(name for name in (BEST_KNOWN,) if name in MEASURES)]
+
+
+def evaluate_task(scenario: AnyScenario, agents: Any, *, episodes: int = EPISODES, seed: int = SEED) -> Result:
+    """Result of agents in the evaluation list of a task. Agents that choose minimise the honest cost.
+
+    The best known cost, and so the share of the possible, is measured only in the worlds of the benchmark's lists.
+    """
+    loaded = load_scenario(scenario)
+    is_listed = loaded.name in group_of_scenarios(BENCHMARK) and seed == SEED and episodes <= EPISODES
+    measures = ["pushed_mps", *(name for name in benchmark_measures() if is_listed or name != BEST_KNOWN)]
+    return evaluate(loaded, agents, episodes=episodes, seed=seed, harm_count=COUNT, measures=measures)
+
+
+def benchmark_sheet(tables: Mapping[str, SummaryTable]) -> Sheet:
+    """Table of the benchmark: a section for each task (key of ``tables``), a row for each team."""
+    rows: list[Any] = []
+    for task, table in tables.items():
+        rows.append(task)
+        rows += [(row.marked, *(row.estimates.get(column.key) for column in COLUMNS)) for row in table]
+    return Sheet("", [Column("Agent", "agent", text=True), *COLUMNS], rows, NOTE, gap=1, keep=3)
+
+
+def benchmark_rows(tables: Mapping[str, SummaryTable], **about: Any) -> list[dict[str, Any]]:
+    """Rows of the benchmark's file. ``about``: further columns, such as ``method``, ``seed``, ``decisions``, ``cpu_s``.
+
+    Columns of the file: ``task``, ``agent``, ``about``, the estimates of ``COLUMNS`` with intervals, what the team
+    knows, the number and SHA-256 of the worlds, the digest of the physics and the version.
+    """
+    rows = []
+    for task, table in tables.items():
+        identity = {key: table.parameters[key] for key in ("worlds_sha256", "physics_digest")}
+        version = table.parameters["versions"][DISTRIBUTION]
+        for row in table:
+            keys = *(column.key for column in COLUMNS), "best_known_honest"
+            values = Estimate.side_by_side({key: row.estimates.get(key) for key in keys})
+            names = {"task": task, "agent": row.agent, **about}
+            known = {"knows": row.knows, "sees_through_channel": row.sees_through, "episodes": row.episodes}
+            rows.append({**names, **values, **known, **identity, "version": version})
+    return rows

@@ -1,0 +1,120 @@
+"""The scripts of ``train/benchmark``: table, cross-play, data sets, and methods that learn."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.benchmark import benchmark_rows, evaluate_task
+from ethbrake_marl.files.sheet import csv_text
+from tests.docs.site import load
+from tests.refused import refused
+
+FOLDER = Path(__file__).resolve().parents[2] / "train" / "benchmark"
+table = load(FOLDER / "table")
+cross_play = load(FOLDER / "cross_play")
+data = load(FOLDER / "data")
+PNG = b"\x89PNG"
+SCALE = {"honest_cost": "30", "best_known_honest": "10", "sees_through_channel": "False"}
+MEANS = dict.fromkeys(table.MEANS, "1")
+IDENTITY = {"worlds_sha256": "a", "physics_digest": "b"}
+
+
+def rows_file(path: Path, *rows: dict[str, Any]) -> Path:
+    path.write_text(csv_text([{"task": "t", **SCALE, **MEANS, **IDENTITY, **row} for row in rows]))
+    return path
+
+
+def test_table__shows_the_middle_three_of_five_seeds_on_the_scale(tmp_path: Path) -> None:
+    # without the best and the worst seed: mean 46 / 3; (30 - 46 / 3) / (30 - 10) = 73.3 %
+    seeds = [
+        {"agent": "m", "method": "m", "seed": k, "decisions": 200, "cpu_s": 10 * k, "honest_cost": cost}
+        for k, cost in enumerate((11, 20, 15, 99, 10))
+    ]
+    rules = rows_file(
+        tmp_path / "rules.csv",
+        {"agent": "full_brake"},
+        {"agent": "omniscient", "honest_cost": "12"} | {"sees_through_channel": "True"},
+    )
+    cells = table.read_rows([rules, rows_file(tmp_path / "m.csv", *seeds)])
+    head, _, first, second, last, best = table.table(cells, "t")
+    assert [row[0] for row in (first, second, last, best)] == [
+        "`omniscient` †",
+        "`m`",
+        "`full_brake`",
+        "best known (search)",
+    ]
+    assert second[1:4] == ["5", "200", "20"] and second[4].startswith("73.3 % [") and second[5].startswith("15.33 [")
+    assert first[4] == "90.0 %" and last[4] == "0.0 %" and best[4:6] == ["100.0 %", "10.00"] and len(head) == len(best)
+    figure = tmp_path / "figure.png"
+    table.write_picture(figure, table.draw(cells, ["t"]), force=True)
+    assert figure.read_bytes().startswith(PNG)
+
+
+def test_table__refuses_rows_of_other_worlds_and_a_task_without_its_scale(tmp_path: Path) -> None:
+    mine, other = ({"agent": "m", **more} for more in ({}, {"worlds_sha256": "c"}))
+    with refused("has other worlds or another physics than other files"):
+        table.read_rows([rows_file(tmp_path / "a.csv", mine), rows_file(tmp_path / "b.csv", other)])
+    with refused("t: has no row of full_brake"):
+        table.table(table.read_rows([tmp_path / "a.csv"]), "t")
+
+
+def test_table__on_the_page_is_that_of_the_committed_rows() -> None:
+    page = (FOLDER.parents[1] / "docs" / "results" / "benchmark.md").read_text("utf-8")
+    assert table.text_of(table.read_rows(table.ROWS.glob("*.csv"))) in page
+
+
+def test_cross_play__of_two_teams_by_hand() -> None:
+    cost = cross_play.cross_play("benchmark-pair", ["full_brake", "constant:5"])
+    assert cost.shape == (2, 2, 2000)
+    drivers = {"vehicle_2": "full_brake", "vehicle_3": "constant:5"}
+    mixed = eb.evaluate("benchmark-pair", {"mixed": drivers}, episodes=2000)["mixed"]["honest_cost"]
+    assert cost[0, 1].tolist() == mixed.tolist()
+    with refused("needs two agents or more, and two learners or more"):
+        cross_play.cross_play("benchmark-single", ["full_brake", "constant:5"])
+
+
+def test_data__of_a_task_has_the_same_digest_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import runpy
+
+    pytest.importorskip("pyarrow")
+    for name in ("one", "two"):
+        monkeypatch.setattr(
+            sys, "argv", ["data.py", "benchmark-all", str(tmp_path / f"{name}.parquet"), "--episodes", "3"]
+        )
+        runpy.run_path(str(FOLDER / "data.py"), run_name="__main__")
+    one, two = (line.rpartition(" ")[2] for line in capsys.readouterr().out.splitlines())
+    assert one == two == data.digest(tmp_path / "one.parquet")
+
+
+METHODS = [("sb3", "ppo"), ("sb3", "sac"), ("clone", "clone"), ("marl", "ippo"), ("marl", "mappo"), ("marl", "iql")]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("file", "method"), METHODS)
+def test_method__saves_what_its_agent_drives(file: str, method: str, tmp_path: Path) -> None:
+    if file == "marl" and find_spec("benchmarl") is None:
+        pytest.skip("needs the extra marl")
+    module, task = load(FOLDER / file), eb.load_scenario("benchmark-pair")
+    getattr(module, method)(task, 0, 5_000, tmp_path)
+    agents = {"full_brake": "full_brake", "mine": f"{FOLDER / file}.py:make_agent:{tmp_path}"}
+    result = evaluate_task(task, agents, episodes=50)
+    rows = benchmark_rows({"benchmark-pair": eb.summarise(result)}, method=method)
+    assert rows[1]["method"] == method and np.isfinite(rows[1]["honest_cost"])
+    assert (result["mine"]["honest_cost"] != result["full_brake"]["honest_cost"]).any()
+
+
+def test_marl__needs_several_learners(tmp_path: Path) -> None:
+    pytest.importorskip("benchmarl", reason="needs the extra marl")
+    with pytest.raises(InvalidInput, match="has one learner"):
+        load(FOLDER / "marl").ippo(eb.load_scenario("benchmark-single"), 0, 100, tmp_path)

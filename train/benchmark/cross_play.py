@@ -1,0 +1,57 @@
+"""Cross-play: the front learner of one team drives with the other learners of another team.
+
+    python train/benchmark/cross_play.py benchmark-pair team@runs/benchmark/runs/benchmark-pair-vine-seed{0,1,2,3,4}
+
+Prints the honest cost as a matrix (row: team of the front learner; column: team of the others), the mean on the
+diagonal, where teams drive as they were trained, and the mean off the diagonal, with intervals over the worlds.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ethbrake_marl as eb
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.evaluation.benchmark import COUNT, evaluate_task
+from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.names import make_teams
+
+
+def cross_play(task: str, agents: Sequence[str]) -> NDArray[Any]:
+    """Honest cost of each world, [teams of the front learner, teams of the others, worlds] m2/s2."""
+    scenario = eb.load_scenario(task)
+    front, *others = scenario.learners
+    if not others or len(agents) < 2:
+        raise InvalidInput(
+            f"cross-play needs two agents or more, and two learners or more; {task} has {1 + len(others)}"
+        )
+    teams = [*make_teams(agents, scenario, harm_count=COUNT).values()]
+    mixed = {
+        f"{i},{j}": eb.Team(f"{i},{j}", {**rear.drivers, front: first.drivers[front]})
+        for i, first in enumerate(teams)
+        for j, rear in enumerate(teams)
+    }
+    result = evaluate_task(scenario, mixed)
+    return np.array([[result[f"{i},{j}"]["honest_cost"] for j in range(len(teams))] for i in range(len(teams))])
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("task", help="name of a scenario with several learners")
+    parser.add_argument("agents", nargs="+", help="names of agents or teams")
+    args = parser.parse_args()
+    try:
+        cost = cross_play(args.task, args.agents)
+    except (EthBrakeError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    for row in cost.mean(axis=2):
+        print(" ".join(f"{value:7.2f}" for value in row))
+    same = np.eye(len(cost), dtype=bool)
+    print(
+        f"on the diagonal {mean(cost[same].mean(axis=0)).in_words()}, off {mean(cost[~same].mean(axis=0)).in_words()}"
+    )

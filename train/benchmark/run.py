@@ -1,0 +1,199 @@
+"""Train methods on tasks with several seeds, and evaluate them: a row for each. Read it from top to bottom.
+
+    python train/benchmark/run.py --tasks benchmark-pair --methods sb3-ppo mine.py:train --output runs/benchmark
+    python train/benchmark/run.py --tasks paper-random --methods ppo sac --list-seed 8 --output runs/sweep
+
+A method is a name of `METHODS`, a recipe (its name or file), or `FILE.py:FUNCTION`. Such a function
+`train(task, seed, decisions, folder)` trains with that many decisions of all learners together, and saves what it has
+learned in `folder`; `make_agent(folder, settings)` of the same file makes the agent or team of it.
+
+Each training has a folder in `OUTPUT/runs`, and each evaluated one a file in `OUTPUT/rows`. After an interruption,
+start the same command again: finished trainings are skipped, and an unfinished one of a recipe goes on from its last
+checkpoint. `OUTPUT/rows.csv` has all rows. `cpu_s` is the processor time of the training, without evaluations.
+
+On a Ray cluster, every computer needs the same packages, and must see `--output` under the same path. Everybody who
+can reach the ports of the cluster can run code on it with your rights, so open them to nobody else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import ethbrake_marl as eb
+from ethbrake_marl.cli.settings import read_settings
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.evaluation.benchmark import BENCHMARK, EPISODES, benchmark_rows, evaluate_task
+from ethbrake_marl.evaluation.door import SEED
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.python_file import load_from_file
+from ethbrake_marl.files.sheet import csv_text
+from ethbrake_marl.files.store import new_folder, write_file
+from ethbrake_marl.parallel import run_each
+from ethbrake_marl.training.job import Job as RecipeJob, folder_of_many
+from ethbrake_marl.training.run import RunFolder
+from ethbrake_marl.training.training import Training
+from ethbrake_marl.worlds.catalogue import group_of_scenarios
+
+HERE = Path(__file__).resolve().parent
+DECISIONS = 200_000  # of all learners together
+METHODS = {
+    "sb3-ppo": f"{HERE}/sb3.py:ppo",
+    "sb3-sac": f"{HERE}/sb3.py:sac",
+    "ippo": f"{HERE}/marl.py:ippo",
+    "mappo": f"{HERE}/marl.py:mappo",
+    "iql": f"{HERE}/marl.py:iql",
+    "clone": f"{HERE}/clone.py:clone",
+}
+ABOUT = "training.json"  # file in the folder of a training by a Python file: decisions, scenario, processor time
+
+
+# 1. A training and its evaluation.
+
+
+class Job(NamedTuple):
+    task: eb.Scenario
+    method: str
+    seed: int
+    decisions: int
+    output: Path
+    episodes: int = EPISODES
+    list_seed: int = SEED
+    recipe: Training | None = None  # for a method that is a recipe
+    settings: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        method = re.sub("[^a-z0-9_]+", "-", Path(self.method).name.lower().removesuffix(".yaml"))
+        return f"{self.task.name}-{method}-seed{self.seed}"
+
+    @property
+    def folder(self) -> Path:
+        return self.output / "runs" / self.name
+
+    @property
+    def agent(self) -> str:
+        """Name of the trained agent, for `--agents`."""
+        if self.recipe is not None:
+            return f"team@{self.folder}"
+        return f"{METHODS.get(self.method, self.method).rpartition(':')[0]}:make_agent:{self.folder}"
+
+    def finish(self) -> dict[str, Any]:
+        """Train and evaluate, unless that is done; return the row, or one with the `reason` of a failure."""
+        file = self.output / "rows" / f"{self.name}.csv"
+        try:
+            about = self.train()
+            if not file.exists():
+                write_file(file, csv_text([self.evaluate(about)]).encode())
+        except EthBrakeError as error:
+            return {"task": self.task.name, "method": self.method, "seed": self.seed, "reason": str(error)}
+        (row,) = csv.DictReader(file.read_text().splitlines())
+        return row
+
+    def train(self) -> dict[str, Any]:
+        """Train unless that is done; return the number of decisions and the processor time, in s."""
+        if self.recipe is not None:
+            training = RecipeJob(self.recipe, self.folder, self.settings)
+            if not training.finish():
+                raise KeyboardInterrupt
+            last = read_object(RunFolder(self.folder).status)["evaluations"][-1]
+            return {"decisions": last["steps"], "cpu_s": round(last["cpu_s"], 1)}
+        about = {"decisions": self.decisions, "scenario": self.task.content()}
+        if not self.folder.exists():
+            train = load_from_file(*METHODS.get(self.method, self.method).rsplit(":", 1))
+            with new_folder(self.folder) as partial:
+                start = time.process_time()
+                train(self.task, self.seed, self.decisions, partial)
+                spent = {"cpu_s": round(time.process_time() - start, 1)}
+                (partial / ABOUT).write_text(json.dumps(about | spent))
+        done = read_object(self.folder / ABOUT)
+        if {key: done.get(key) for key in about} != json.loads(json.dumps(about)):
+            raise InvalidInput(f"{self.folder}: has a training with other settings; delete it, or use another folder")
+        return {"decisions": self.decisions, "cpu_s": done["cpu_s"]}
+
+    def evaluate(self, about: dict[str, Any]) -> dict[str, Any]:
+        agents = {"full_brake": "full_brake", self.method: self.agent}
+        result = evaluate_task(self.task, agents, episodes=self.episodes, seed=self.list_seed)
+        about = {"method": self.method, "seed": self.seed, **about}
+        return benchmark_rows({self.task.name: eb.summarise(result)}, **about)[1]
+
+
+# 2. What to train. All names and settings are checked before the first training begins.
+
+
+def read_jobs(args: argparse.Namespace) -> list[Job]:
+    """All jobs, in the order seed, task, method."""
+    if args.jobs is not None and args.jobs < 1:
+        raise InvalidInput(f"--jobs {args.jobs}: must be 1 or more")
+    recipes = {name: eb.load_recipe(name) for name in args.methods if name not in METHODS and ".py:" not in name}
+    settings = read_settings(args.set, [key for recipe in recipes.values() for key in type(recipe).model_fields])
+    tasks = [settings.change_scenario(name) for name in args.tasks or group_of_scenarios(BENCHMARK)]
+    for name, recipe in recipes.items():
+        recipes[name] = settings.change_recipe(recipe.replace(total_steps=args.decisions or recipe.total_steps))
+    jobs = []
+    for seed, task, name in product(range(args.seeds), tasks, args.methods):
+        recipe = Training.of(recipes[name], task, seed=seed) if name in recipes else None
+        options = args.output.absolute(), args.episodes, args.list_seed, recipe, settings.texts
+        jobs.append(Job(task, name, seed, args.decisions or DECISIONS, *options))
+    if not jobs or len({job.folder for job in jobs}) < len(jobs):
+        raise InvalidInput("a run needs at least one seed, and each task and each method only once")
+    return jobs
+
+
+# 3. Train, each job in a process of its own, and write the table.
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do all jobs, write `rows.csv`, and return how many failed."""
+    jobs, rows = read_jobs(args), []
+    with folder_of_many(args.output, "rows.csv"):
+        (args.output / "rows").mkdir(exist_ok=True)
+        with on_ray(args.ray) if args.ray else nullcontext():
+            for job, row in zip(jobs, run_each(((job.finish,) for job in jobs), args.jobs), strict=True):
+                rows.append(row)
+                print(f"{len(rows)} of {len(jobs)}: {job.name}: {row.get('reason') or 'finished'}", flush=True)
+        write_file(args.output / "rows.csv", csv_text(rows).encode())
+    return sum("reason" in row for row in rows)
+
+
+@contextmanager
+def on_ray(address: str) -> Iterator[None]:
+    """Context manager in which joblib sends its work to a Ray cluster, or to Ray on this machine (`local`)."""
+    import ray
+    from joblib import parallel_config
+    from ray.util.joblib import register_ray
+
+    ray.init(address=address, runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}})
+    register_ray()
+    with parallel_config(backend="ray"):
+        yield
+    ray.shutdown()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", metavar="NAME", help="names or paths of scenarios (default: benchmark)")
+    parser.add_argument("--methods", nargs="+", required=True, metavar="NAME", help=f"{', '.join(METHODS)}, ...")
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="seeds 0 to N - 1 (default: 5)")
+    parser.add_argument("--decisions", type=int, help="of all learners together (default: 200,000, or as in a recipe)")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings of all tasks and recipes")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help=f"evaluated worlds (default: {EPISODES})")
+    parser.add_argument("--list-seed", type=int, default=SEED, help=f"seed of these worlds (default: {SEED})")
+    parser.add_argument("--jobs", type=int, metavar="N", help="trainings at the same time (default: 1)")
+    parser.add_argument("--ray", metavar="ADDRESS", help="a running Ray cluster, or `local` for Ray on this machine")
+    parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="folder of all results")
+    try:
+        failed = run(parser.parse_args())
+    except KeyboardInterrupt:
+        parser.exit(130, "interrupted; the same command goes on\n")
+    except (EthBrakeError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
+    parser.exit(1 if failed else 0)
