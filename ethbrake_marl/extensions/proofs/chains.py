@@ -48,7 +48,6 @@ TOUCHES = 4.0  # at least the number of touches of a pair in one interval of con
 OUTWARD = 1e-9  # margin of places (m) and speeds (m/s) against rounding
 NEAR_M = 1e-8  # the same margin where a vehicle must be at a place
 DRIVES = 8  # number of parts into which the driving before a third contact is divided
-TIGHTENINGS = 4  # halvings of the range of the second closing speed
 
 
 @kernel
@@ -188,14 +187,6 @@ def front_chains(at, box, until_end):
     driven = drive_to_rear(at, start, most, v_r - box[HARD_2], duration, room)
     if driven == math.inf:
         return math.inf
-    high = box[HARD_2]
-    if drive_to_rear(at, start, most, v_r - box[SOFT_2], duration, room) == math.inf:
-        for _ in range(TIGHTENINGS):
-            middle = 0.5 * (box[SOFT_2] + high)
-            if drive_to_rear(at, start, most, v_r - middle, duration, room) == math.inf:
-                box[SOFT_2] = middle
-            else:
-                high = middle
     cost += PRICE * driven
     cost += box[SOFT_2] * box[SOFT_2]
     # it cannot be ahead of the front vehicle
@@ -294,14 +285,6 @@ def rear_chains(at, box, until_end):
     driven = drive_to_front(at, start, v_l + box[HARD_2], duration, room)
     if driven == math.inf:
         return math.inf
-    high = box[HARD_2]
-    if drive_to_front(at, start, v_l + box[SOFT_2], duration, room) == math.inf:
-        for _ in range(TIGHTENINGS):
-            middle = 0.5 * (box[SOFT_2] + high)
-            if drive_to_front(at, start, v_l + middle, duration, room) == math.inf:
-                box[SOFT_2] = middle
-            else:
-                high = middle
     cost += PRICE * driven
     cost += box[SOFT_2] * box[SOFT_2]
     # it stays ahead of the rear vehicle, and of itself if it braked
