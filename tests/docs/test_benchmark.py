@@ -7,7 +7,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import ethbrake_marl as eb
@@ -110,7 +109,7 @@ def test_method__saves_what_its_agent_drives(file: str, method: str, tmp_path: P
     agents = {"full_brake": "full_brake", "mine": f"{FOLDER / file}.py:make_agent:{tmp_path}"}
     result = evaluate_task(task, agents, episodes=50)
     rows = benchmark_rows({"benchmark-pair": eb.summarise(result)}, method=method)
-    assert rows[1]["method"] == method and np.isfinite(rows[1]["honest_cost"])
+    assert rows[1]["method"] == method and rows[1]["share_of_possible_reduction_honest"] < 1.0
     assert (result["mine"]["honest_cost"] != result["full_brake"]["honest_cost"]).any()
 
 
