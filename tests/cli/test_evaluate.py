@@ -70,37 +70,6 @@ def test_group__has_a_folder_of_results_for_each_scenario(ethbrake: Command) -> 
     assert not Path("new/stress-wide/worlds.csv").exists()
 
 
-MINE = """
-import ethbrake_marl as eb
-
-
-def make_agent(argument, settings):
-    return eb.make_agent("constant:5")
-"""
-
-
-def test_benchmark__prints_a_row_for_each_task_and_writes_it(ethbrake: Command) -> None:
-    Path("mine.py").write_text(MINE)
-    words = ("evaluate", "--scenario", "benchmark", "--episodes", "40", "--output", "new")
-    agents = "full_brake,e_v2x_bm,mine.py:make_agent"
-    printed = told_json(ethbrake(*words, "--agents", agents, "--json"))
-    written = rows_of(Path("new/rows.csv"))
-    names = [(row["task"], row["agent"]) for row in written]
-    assert names == [(row["task"], row["agent"]) for row in printed] and len({*names}) == 7 * 3
-    for text, row in zip(written, printed, strict=True):
-        result = eb.read_result(f"new/{row['task']}/results.json")[row["agent"]]
-        for key in ("honest_cost", "worst5_honest", "maximin_honest", "pushed_mps", "collision_rate"):
-            assert float(text[key]) == row[key] == result[key]
-        assert text["worlds_sha256"] == result["worlds_sha256"] and row["version"] == eb.__version__
-        assert row["share_of_possible_reduction_honest"] == 0.0 or row["agent"] != "full_brake"
-    chosen = [row["honest_cost"] for row in printed if row["agent"] == "e_v2x_bm"]
-    again = told_json(ethbrake("evaluate", "--scenario", "benchmark-all", "--episodes", "40", "--agents", "e_v2x_bm",
-                               "--set", "rules=honest", "--json"))  # fmt: skip
-    assert again[0]["honest_cost"] == chosen[0]  # by default agents minimise the honest cost
-    shown = ethbrake(*words, "--agents", "coast", "--force").out
-    assert "benchmark-truck" in shown and "Possible" in shown
-
-
 TEAM = """
 import ethbrake_marl as eb
 

@@ -367,7 +367,7 @@ def test_name_of_a_new_scenario__is_a_plain_word(name: str) -> None:
 def test_unknown_scenario__is_told_what_is_near() -> None:
     with refused("unknown scenario 'paper-randon'; did you mean 'paper-random'?", UnknownName):
         load_scenario("paper-randon")
-    with refused("unknown scenario 'zzz'; known: cooperation-1-front, ", UnknownName):
+    with refused("unknown scenario 'zzz'; known: benchmark-all, ", UnknownName):
         load_scenario("zzz")
 
 

@@ -298,8 +298,8 @@ def test_catalogue__has_groups() -> None:
     assert [task.removeprefix("benchmark-") for task in tasks] == [
         "all", "blocked", "five", "noisy", "pair", "single", "truck",
     ]  # fmt: skip
-    learners = {task: load_scenario(task).learners for task in tasks}
-    assert learners["benchmark-five"] == (1, 2, 3, 4, 5) and learners["benchmark-blocked"] == (2, 3)
+    assert load_scenario("benchmark-five").learners == (1, 2, 3, 4, 5)
+    assert load_scenario("benchmark-blocked").learners == (2, 3)
     assert group_of_scenarios("stress") == ["stress-wide", "stress-wide-obstacle"]
     assert group_of_scenarios("nothing") == []
 

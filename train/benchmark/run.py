@@ -9,7 +9,8 @@ learned in `folder`; `make_agent(folder, settings)` of the same file makes the a
 
 Each training has a folder in `OUTPUT/runs`, and each evaluated one a file in `OUTPUT/rows`. After an interruption,
 start the same command again: finished trainings are skipped, and an unfinished one of a recipe goes on from its last
-checkpoint. `OUTPUT/rows.csv` has all rows. `cpu_s` is the processor time of the training, without evaluations.
+checkpoint. `OUTPUT/rows.csv` has all rows. `cpu_s` is the processor time of the training, without
+evaluations and compiling.
 
 On a Ray cluster, every computer needs the same packages, and must see `--output` under the same path. Everybody who
 can reach the ports of the cluster can run code on it with your rights, so open them to nobody else.
@@ -26,6 +27,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import ethbrake_marl as eb
@@ -53,6 +55,7 @@ METHODS = {
     "iql": f"{HERE}/marl.py:iql",
     "clone": f"{HERE}/clone.py:clone",
 }
+WARM: set[tuple[str, str]] = set()  # tasks and methods for which this process has compiled everything
 ABOUT = "training.json"  # file in the folder of a training by a Python file: decisions, scenario, processor time
 
 
@@ -90,6 +93,8 @@ class Job(NamedTuple):
         """Train and evaluate, unless that is done; return the row, or one with the `reason` of a failure."""
         file = self.output / "rows" / f"{self.name}.csv"
         try:
+            if not self.folder.exists():
+                self.warm_up()
             about = self.train()
             if not file.exists():
                 write_file(file, csv_text([self.evaluate(about)]).encode())
@@ -97,6 +102,14 @@ class Job(NamedTuple):
             return {"task": self.task.name, "method": self.method, "seed": self.seed, "reason": str(error)}
         (row,) = csv.DictReader(file.read_text().splitlines())
         return row
+
+    def warm_up(self) -> None:
+        """Train once as briefly as possible, so that compiling is no part of the training's processor time."""
+        if (self.task.name, self.method) not in WARM:
+            WARM.add((self.task.name, self.method))
+            recipe = self.recipe and Training.of(self.recipe.recipe.replace(total_steps=1), self.task)
+            with TemporaryDirectory() as scratch:
+                self._replace(decisions=1, recipe=recipe, output=Path(scratch)).train()
 
     def train(self) -> dict[str, Any]:
         """Train unless that is done; return the number of decisions and the processor time, in s."""
