@@ -1,4 +1,4 @@
-"""Harm, honest cost and processor time of agents on the same worlds, for docs/results/agents.md.
+"""Harm, honest cost and processor time of agents on the same worlds, for docs/findings.md.
 
     .venv/bin/python docs/studies/equal_time.py [AGENT ...]
 

@@ -1,4 +1,4 @@
-"""What honesty costs: best known braking against the price of a push (docs/findings.md, docs/results/agents.md).
+"""What honesty costs: best known braking against the price of a push (docs/findings.md).
 
     .venv/bin/python docs/studies/honesty.py docs/figures/honesty.png
 
