@@ -27,7 +27,7 @@ from ethbrake_marl.training.training import Training
 
 TESTS = {"paper-random": "first", "paper-random-brake-only": "first", "paper-random-obstacle": "total"}
 STEPS = {  # recipe -> decisions in half a minute, measured in a short training
-    "quick": 4_400_000,
+    "quick": 2_300_000,
     "ppo": 1_080_000,
     "sac": 225_000,
     "rollout-classification": 270_000,

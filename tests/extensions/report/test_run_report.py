@@ -38,7 +38,7 @@ def test_run__leaves_results_pictures_page_and_policy(finished_run: Path) -> Non
     assert html.count('"pieces":') == 50 * len(AGENTS)
     page = Page(html)
     assert "Nothing in this package is tuned to these rows" in page.text and "33.5878" in page.text
-    assert "ethbrake run: paper-random" in page.text and "256 steps of 256 (finished)" in page.text
+    assert "ethbrake run: paper-random" in page.text and ", on paper-random: 256 steps of 256 (finished)" in page.text
     titles = [attributes.get("id") for tag, attributes in page.tags if tag == "section"]
     assert titles[:4] == ["brake-only-test", "obstacle-test", "learning-curve", "worst-ten-worlds"]
     assert {"agents-and-measures", "the-paper's-rows", "figures", "versions"} <= {*titles[4:]}
