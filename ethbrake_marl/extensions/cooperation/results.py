@@ -292,8 +292,8 @@ def ablation_figure(results: Json, caption: str) -> Figure:
             colour = series_style(1 if number == 0 else number + 3)["color"]
             axes.bar(places, [h.value for h in harms], bar, yerr=ends, capsize=3, label=algorithm, color=colour)
             for place, harm in zip(places, harms, strict=True):
-                words, at_top = f"{harm.value:.2f}", axes.get_xaxis_transform()
-                axes.text(place, 0.94, words, transform=at_top, ha="center", fontsize=8)
+                mean, at_top = f"{harm.value:.2f}", axes.get_xaxis_transform()
+                axes.text(place, 0.94, mean, transform=at_top, ha="center", fontsize=8)
         _draw_bounds(axes, [(at[level["level"]], level[count]["searched"]) for level in levels], 0.42 * unit)
         if results["settings"]["swept"] is None:
             words = [name.removeprefix("cooperation-").removeprefix("level-").replace("-", "\n", 1) for name in names]
