@@ -8,7 +8,7 @@ most shipped scenarios; nothing else is taken from them.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +80,8 @@ def mixture() -> eb.Scenario:
 
 
 if __name__ == "__main__":
-    run = Path(sys.argv[1])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="folder of the training")
+    run = parser.parse_args().run
     result = resume(run) if run.exists() else train("universal-lines", mixture(), run)
     print(result.status, result.metrics)

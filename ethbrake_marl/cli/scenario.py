@@ -62,30 +62,35 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
     Simulates the first 200 worlds of the evaluation list. Shows the range of each quantity in these worlds, whom each
     learner knows, and whether there is anything to learn: the harm of full braking, of the best constant deceleration,
-    and of the best known commands.
+    and of the best known commands. A mixture of lines is tried line by line.
     """
     from ethbrake_marl.evaluation.trial import try_scenario
     from ethbrake_marl.worlds.catalogue import load_scenario
 
     with Out(as_json=as_json) as out:
         scenario = load_scenario(path)
-        trial = try_scenario(scenario)
-        content = {
-            "name": scenario.name,
-            "vehicles": scenario.vehicles,
-            "learners": [scenario.vehicle_names[body - 1] for body in scenario.learners],
-            "worlds": trial.drawn.worlds.n,
-            "rejected": trial.drawn.rejected,
-            "early_impacts": trial.early,
-            "moving_at_horizon": trial.moving,
-            "vehicle_1_late": trial.late,
-            "known": trial.known,
-            "harm": trial.harm,
-            "refused_by": trial.refused,
-            "quantities": _ranges(trial),
-            "kinds": {name: dict(Counter(column.tolist())) for name, column in _kinds(trial).items()},
-        }
-        out.result(content, *_trial_lines(scenario, trial))
+        trials = [(line, try_scenario(line)) for line in scenario.lines or (scenario,)]
+        contents = [_trial_content(line, trial) for line, trial in trials]
+        words = [text for line, trial in trials for text in _trial_lines(line, trial)]
+        out.result({"name": scenario.name, "lines": contents} if scenario.lines else contents[0], *words)
+
+
+def _trial_content(scenario: Scenario, trial: Trial) -> dict[str, Any]:
+    return {
+        "name": scenario.name,
+        "vehicles": scenario.vehicles,
+        "learners": [scenario.vehicle_names[body - 1] for body in scenario.learners],
+        "worlds": trial.drawn.worlds.n,
+        "rejected": trial.drawn.rejected,
+        "early_impacts": trial.early,
+        "moving_at_horizon": trial.moving,
+        "vehicle_1_late": trial.late,
+        "known": trial.known,
+        "harm": trial.harm,
+        "refused_by": trial.refused,
+        "quantities": _ranges(trial),
+        "kinds": {name: dict(Counter(column.tolist())) for name, column in _kinds(trial).items()},
+    }
 
 
 def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:

@@ -38,7 +38,7 @@ def drive_list(training: Training) -> Callable[[Mapping[str, Agent]], dict[str, 
     It returns metrics, which are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost`` (for
     exact impacts), ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a learner's
     objective is not the harm of the line, there is also each learner's objective (``objective_vehicle_2``), and their
-    mean ``objective``. In a mixture of lines every line has its share of the worlds, and ``objective_NAME`` is what is
+    mean ``objective``. In a mixture of lines every line has its share of the worlds, and ``relative_NAME`` is what is
     minimised in the line NAME divided by that of full braking; ``objective`` is its mean over the worlds.
     """
     if training.scenario.lines:
@@ -80,7 +80,7 @@ def _drive_lines(lines: Sequence[Training]) -> Callable[[Mapping[str, Agent]], d
         for line, drive_line, cost in parts:
             metrics = drive_line({name: agents[name] for name in line.learners})
             relative = deciding(metrics, line.recipe.reward.harm_count) / cost
-            relative_costs[f"{OBJECTIVE_METRIC}_{line.scenario.name}"] = relative
+            relative_costs[f"relative_{line.scenario.name}"] = relative
             all_metrics.append({**metrics, OBJECTIVE_METRIC: relative})
         names = [name for name in all_metrics[0] if all(name in metrics for metrics in all_metrics)]
         columns = {name: np.array([metrics[name] for metrics in all_metrics]) for name in names}

@@ -46,14 +46,18 @@ class LinesVecEnv(VecEnv):
             part.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [value for part in self.environments for value in part.get_attr(attr_name)]
+        return [value for part in self.environments for value in part.get_attr(attr_name, indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         for part in self.environments:
-            part.set_attr(attr_name, value)
+            part.set_attr(attr_name, value, indices)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        return [result for part in self.environments for result in part.env_method(method_name, *args, **kwargs)]
+        return [
+            result
+            for part in self.environments
+            for result in part.env_method(method_name, *args, indices=indices, **kwargs)
+        ]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         return [False] * self.num_envs

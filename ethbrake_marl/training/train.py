@@ -281,7 +281,8 @@ def _check_unfinished(folder: RunFolder, training: Training) -> None:
     if status["status"] == "finished" or (status.get("stage") is not None and not any(folder.checkpoints.glob("*"))):
         raise InvalidInput(
             f"{folder.path}: this training has finished and cannot be resumed; evaluate its policy with: ethbrake"
-            f" evaluate --scenario {training.scenario.name} --agents full_brake,{agent_of(training, folder.path)}"
+            f" evaluate --scenario {training.lines[0].scenario.name} --agents"
+            f" full_brake,{agent_of(training, folder.path)}"
         )
 
 

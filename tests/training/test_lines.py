@@ -74,6 +74,9 @@ def test_training__needs_an_algorithm_that_mixes_lines_and_a_learner_in_every_li
     class Mixing(type(TINY)):  # type: ignore[misc]  # the class is a value here
         mixes_lines = True
 
+    on_gpu = Mixing(**TINY.model_dump(mode="json") | {"device": "cuda"})
+    with refused(f"of recipe {TINY.name!r} trains on one line on cuda; use one of the scenarios, or, on cpu, another"):
+        Training.of(on_gpu, LINES)
     with refused("scenario 'cooperation-2-five' has no learner"):
         Training.of(Mixing(**TINY.model_dump(mode="json")), silent)
 
@@ -113,7 +116,7 @@ def test_metrics__are_means_over_the_worlds_and_costs_relative_to_full_braking()
         coasting["honest_cost"] / full_braking(line)["honest_cost"]
         for line, coasting in zip((first, second), alone, strict=True)
     ]
-    assert [metrics["objective_paper-random"], metrics["objective_five"]] == ratios
+    assert [metrics["relative_paper-random"], metrics["relative_five"]] == ratios
     assert metrics["objective"] == pytest.approx((8 * ratios[0] + 2 * ratios[1]) / 10)
     assert full_braking(TRAINING)["objective"] == pytest.approx(1.0)
 

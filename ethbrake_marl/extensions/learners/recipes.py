@@ -119,6 +119,13 @@ class VineRecipe(BranchingRecipe):
     n_epochs: int = Field(ge=1, le=1000, description="number of passes of each update over the tried decisions")
     network: ActorShape = Field(description=NETWORK)
 
+    @model_validator(mode="after")
+    def _begins_in_one_way(self) -> Self:
+        if self.start is not None and isinstance(self.network.initial_action, float):
+            right = "must be left out, or name a feature, beside the key start, whose policy gives the first action"
+            refuse(("network", "initial_action"), self.network.initial_action, right)
+        return self
+
 
 class ChoosingShape(FileModel):
     """The network that scores actions, which are evenly spaced from -1 to 1."""

@@ -57,7 +57,7 @@ def test_training__resumed_after_a_kill_is_the_same(tmp_path: Path) -> None:
     result = begin(tmp_path / "whole")
     assert result.policy.manifest.learners == ("vehicle_2", "vehicle_3", "vehicle_4")
     assert result.policy.manifest.training_range is not None
-    assert {"objective", "objective_paper-random", "objective_cooperation-2-five"} <= result.metrics.keys()
+    assert {"objective", "relative_paper-random", "relative_cooperation-2-five"} <= result.metrics.keys()
     killed(begin, tmp_path / "run", on_progress=dying_after(3))
     assert resume(tmp_path / "run", on_progress=None).status == "finished"
     assert kept(tmp_path / "run") == kept(tmp_path / "whole")
@@ -72,7 +72,7 @@ def test_training__gets_better_in_every_line(tmp_path: Path) -> None:
         evaluation={"every_updates": 1000, "worlds": 400, "seed": 7},
     )  # fmt: skip
     first, last = train(ample, LINES, tmp_path / "run", on_progress=None).evaluations
-    for name in ("objective_paper-random", "objective_cooperation-2-five"):
+    for name in ("relative_paper-random", "relative_cooperation-2-five"):
         assert last[name] < 0.7 * first[name]
 
 
@@ -86,7 +86,7 @@ def test_command__shows_costs_relative_to_full_braking(ethbrake: Command, empty_
     assert braking["objective"] == pytest.approx(1.0) and trained["objective"] != braking["objective"]
     assert (
         answer["next_command"]
-        == "ethbrake evaluate --scenario SCENARIO --agents full_brake,team@run --set rules=honest"
+        == "ethbrake evaluate --scenario paper-random --agents full_brake,team@run --set rules=honest"
     )
 
 

@@ -110,6 +110,11 @@ def test_network__that_cannot_begin_as_the_feature_is_refused(network: dict[str,
         PLAN.replace(network={"policy": [8], "initial_action": "plan.action"} | network)
 
 
+def test_first_action__is_given_by_one_key() -> None:
+    with refused("network.initial_action = -0.5: must be left out, or name a feature, beside the key start"):
+        VINE.replace(start="universal", network={"policy": [8], "initial_action": -0.5})
+
+
 def test_network__needs_the_feature_that_it_begins_as() -> None:
     with refused("recipe 'vine': the observation lacks the feature plan.action, which network.initial_action names"):
         new_model(PLAN.replace(observation=["own"]))
