@@ -85,9 +85,11 @@ def test_vector_rewards__are_the_harm_that_each_vehicle_bears() -> None:
         scalar.reward_space("vehicle_1")
 
 
-@pytest.mark.parametrize("scenario", ["paper-random-preference", "cooperation-2-five"])
-def test_environment__can_be_pickled_before_and_after_it_observes(scenario: str) -> None:
-    env = began(scenario=scenario)
+@pytest.mark.parametrize(
+    ("scenario", "observation"), [("paper-random-preference", ["own", "own_harm_weight"]), ("cooperation-2-five", None)]
+)
+def test_environment__can_be_pickled_before_and_after_it_observes(scenario: str, observation: list[str] | None) -> None:
+    env = began(scenario=scenario, observation=observation)
     env.step({"vehicle_2": [-0.5]})
     copied = pickle.loads(pickle.dumps(env))
     action = {"vehicle_2": [-0.25]}
