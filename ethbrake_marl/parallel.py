@@ -60,9 +60,10 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
     work = (delayed(_answer)(os.getpid(), _pickle_call(call)) for call in calls)
     batches = [work] if streams else iter(lambda: list(islice(work, PER_PROCESS * jobs)), [])
     for batch in batches:
-        with _blocked_interrupt() if streams else nullcontext():
-            results = parallel(batch)
+        results: Any = ()
         try:
+            with _blocked_interrupt() if streams else nullcontext():
+                results = parallel(batch)  # a Ctrl-C that was blocked arrives at the end of this clause
             for result in results:  # noqa: UP028  # `yield from` would close `results` outside the clause below
                 yield result
         except BrokenProcessPool:
