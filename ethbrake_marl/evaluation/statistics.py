@@ -35,6 +35,7 @@ from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.motion.layout import Bools, Floats
 
 WORST = 0.05  # share of the worlds in ``worst``
+FEWEST = 100  # values with which ``worst`` has an interval
 UPPER = 0.975  # quantile at the upper end of a 95 % interval
 Z = float(ndtri(UPPER))
 LEAST_REST = 1e-6  # of the weight, outside each recording: nothing can be said of others without it
@@ -59,12 +60,13 @@ def worst(values: Floats, clusters: Clusters = None) -> Estimate:
     """Mean of the largest 5 % of the values (conditional value at risk), with its interval.
 
     With the 95 % quantile q of the values it is the mean of ``q + max(value - q, 0) / 0.05`` (Rockafellar and Uryasev
-    2000), and has the t interval of this mean. If no value lies above q, there is no interval.
+    2000), and has the t interval of this mean. There is no interval if no value lies above q, or for fewer than 100
+    values.
     """
     quantile = float(np.quantile(values, 1.0 - WORST, method="inverted_cdf"))
-    if not (values > quantile).any():
-        return Estimate(quantile, None)
-    return mean(quantile + np.maximum(values - quantile, 0.0) / WORST, clusters)
+    estimate = mean(quantile + np.maximum(values - quantile, 0.0) / WORST, clusters)
+    has_interval = len(values) >= FEWEST and (values > quantile).any()
+    return estimate if has_interval else Estimate(estimate.value, None)
 
 
 def difference(values: Floats, baseline: Floats, clusters: Clusters = None) -> Estimate:

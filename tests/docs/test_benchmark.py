@@ -97,6 +97,21 @@ def test_table__refuses_rows_of_other_worlds_and_a_task_without_its_scale(tmp_pa
         table.table(table.read_rows([tmp_path / "a.csv"]), "t")
 
 
+def test_table__refuses_what_must_not_be_one_row(tmp_path: Path) -> None:
+    first = {"agent": "m", "seed": 0, "decisions": 200}
+    for change, message in (
+        ({}, "another row has the same seed"),
+        ({"seed": 1, "decisions": 900}, "decisions = 900, but 200 in another row"),
+        ({"seed": 1, "version": "0.1.0"}, "version = 0.1.0, but"),
+    ):
+        files = [rows_file(tmp_path / "a.csv", first), rows_file(tmp_path / "b.csv", {**first, **change})]
+        with refused(message):
+            table.read_rows(files)
+    (tmp_path / "c.csv").write_text("task,harm\nt,1\n")
+    with refused("c.csv: lacks the column worlds_sha256; must have rows of run.py or of evaluate"):
+        table.read_rows([tmp_path / "c.csv"])
+
+
 def test_table__on_the_page_is_that_of_the_committed_rows() -> None:
     page = (FOLDER.parents[1] / "docs" / "results" / "benchmark.md").read_text("utf-8")
     assert table.text_of(table.read_rows(table.ROWS.glob("*.csv"))) in page

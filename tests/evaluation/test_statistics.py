@@ -33,10 +33,12 @@ def test_mean_of_amounts__does_not_go_below_zero_and_of_zeros_is_not_known() -> 
 
 
 def test_worst_by_hand() -> None:
-    # of 1 ... 40 the largest 5 % are 39 and 40; over the quantile 38: 38 + 1 / 0.05 = 58, 38 + 2 / 0.05 = 78, 38 x 38
-    found = worst(np.arange(40.0, 0.0, -1.0))
-    by_hand = mean(np.array([38.0] * 38 + [58.0, 78.0]))
-    assert found.value == 39.5 == pytest.approx(by_hand.value) and found.interval == pytest.approx(by_hand.interval)
+    # of 1 ... 100 the largest 5 % are 96 to 100; over the quantile 95: 95 + 1 / 0.05 = 115, ..., 195, and 95 x 95
+    found = worst(np.arange(100.0, 0.0, -1.0))
+    by_hand = mean(np.array([95.0] * 95 + [115.0, 135.0, 155.0, 175.0, 195.0]))
+    assert found.value == 98.0 == pytest.approx(by_hand.value) and found.interval == pytest.approx(by_hand.interval)
+    few = worst(np.arange(40.0, 0.0, -1.0))  # 39 and 40; too few values for an interval
+    assert few.value == pytest.approx(39.5) and few.interval is None
     assert worst(np.array([3.0, 9.0])) == Estimate(9.0, None) == worst(np.full(60, 9.0))
 
 

@@ -124,6 +124,24 @@ def test_run__of_a_method_of_ones_own(run: Run, empty_folder: Path, capsys: pyte
     capsys.readouterr()
     assert run(*words, "60", "--episodes", "30", "--output", "new") == 1
     assert "has a training with other settings" in capsys.readouterr().out
+    assert run(*words, "50", "--episodes", "20", "--output", "new") == 1
+    assert "episodes = 30, not 20; delete it to evaluate again" in capsys.readouterr().out
+    Path("other").mkdir()
+    Path("other/mine.py").write_text(METHOD.replace("6 - seed", "5 - seed"))
+    other_words = ("other/mine.py:train" if word == "mine.py:train" else word for word in words)
+    assert run(*other_words, "50", "--episodes", "30", "--output", "new") == 1
+    assert "has a training with other settings or another file" in capsys.readouterr().out
+
+
+def test_run__goes_on_after_a_failure(run: Run, empty_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("mine.py").write_text(METHOD.replace("(folder /", "1 / seed; (folder /"))
+    Path("half.py").write_text(METHOD.replace("def make_agent", "def make"))
+    words = ("benchmark/run", "--tasks", "benchmark-pair", "--seeds", "2", "--episodes", "9", "--decisions", "9")
+    assert run(*words, "--methods", "mine.py:train", "--output", "new") == 1
+    assert "ZeroDivisionError: division by zero" in capsys.readouterr().out
+    assert [row["seed"] for row in rows_of(Path("new/rows.csv")) if row["reason"]] == ["0"]
+    assert run(*words, "--methods", "mine.py:train", "half.py:train", "--output", "other") == 2
+    assert "make_agent" in capsys.readouterr().err and not Path("other").exists()
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -140,6 +158,7 @@ def test_run__that_fails_is_a_row_with_its_reason(recipe: str, run: Run, tmp_pat
     [
         ((*RUN, "ppp"), "'ppo'"),
         ((*RUN, "ppo", "ppo"), "only once"),
+        ((*RUN, "ppo", "--decisions", "0"), "--decisions 0: must be 1 or more"),
         ((*RUN, "ppo", "--set", "gama=1"), "gamma"),
         ((*RUN, "ppo", "--jobs", "0"), "--jobs 0: must be 1 or more"),
         ((*TUNE, "ppo", "--jobs", "0"), "--jobs and --trials must be 1 or more"),

@@ -25,6 +25,7 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from hashlib import sha256
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -98,9 +99,17 @@ class Job(NamedTuple):
             about = self.train()
             if not file.exists():
                 write_file(file, csv_text([self.evaluate(about)]).encode())
-        except EthBrakeError as error:
-            return {"task": self.task.name, "method": self.method, "seed": self.seed, "reason": str(error)}
-        (row,) = csv.DictReader(file.read_text().splitlines())
+            (row,) = csv.DictReader(file.read_text().splitlines())
+            for name, value in {
+                "episodes": self.episodes,
+                "list_seed": self.list_seed,
+                "version": eb.__version__,
+            }.items():
+                if row.get(name) != f"{value}":
+                    raise InvalidInput(f"{file}: {name} = {row.get(name)}, not {value}; delete it to evaluate again")
+        except Exception as error:  # the other trainings go on
+            reason = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
+            return {"task": self.task.name, "method": self.method, "seed": self.seed, "reason": reason}
         return row
 
     def warm_up(self) -> None:
@@ -119,9 +128,11 @@ class Job(NamedTuple):
                 raise KeyboardInterrupt
             last = read_object(RunFolder(self.folder).status)["evaluations"][-1]
             return {"decisions": last["steps"], "cpu_s": round(last["cpu_s"], 1)}
-        about = {"decisions": self.decisions, "scenario": self.task.content()}
+        path, function = METHODS.get(self.method, self.method).rsplit(":", 1)
+        code = sha256(Path(path).read_bytes()).hexdigest()
+        about = {"decisions": self.decisions, "scenario": self.task.content(), "method": function, "sha256": code}
         if not self.folder.exists():
-            train = load_from_file(*METHODS.get(self.method, self.method).rsplit(":", 1))
+            train = load_from_file(path, function)
             with new_folder(self.folder) as partial:
                 start = time.process_time()
                 train(self.task, self.seed, self.decisions, partial)
@@ -129,13 +140,14 @@ class Job(NamedTuple):
                 (partial / ABOUT).write_text(json.dumps(about | spent))
         done = read_object(self.folder / ABOUT)
         if {key: done.get(key) for key in about} != json.loads(json.dumps(about)):
-            raise InvalidInput(f"{self.folder}: has a training with other settings; delete it, or use another folder")
+            right = "delete it, or use another folder"
+            raise InvalidInput(f"{self.folder}: has a training with other settings or another file; {right}")
         return {"decisions": self.decisions, "cpu_s": done["cpu_s"]}
 
     def evaluate(self, about: dict[str, Any]) -> dict[str, Any]:
         agents = {"full_brake": "full_brake", self.method: self.agent}
         result = evaluate_task(self.task, agents, episodes=self.episodes, seed=self.list_seed)
-        about = {"method": self.method, "seed": self.seed, **about}
+        about = {"method": self.method, "seed": self.seed, **about, "list_seed": self.list_seed}
         return benchmark_rows({self.task.name: eb.summarise(result)}, **about)[1]
 
 
@@ -146,7 +158,12 @@ def read_jobs(args: argparse.Namespace) -> list[Job]:
     """All jobs, in the order seed, task, method."""
     if args.jobs is not None and args.jobs < 1:
         raise InvalidInput(f"--jobs {args.jobs}: must be 1 or more")
+    if args.decisions is not None and args.decisions < 1:
+        raise InvalidInput(f"--decisions {args.decisions}: must be 1 or more")
     recipes = {name: eb.load_recipe(name) for name in args.methods if name not in METHODS and ".py:" not in name}
+    for path, function in (METHODS.get(name, name).rsplit(":", 1) for name in args.methods if name not in recipes):
+        load_from_file(path, function)
+        load_from_file(path, "make_agent")
     settings = read_settings(args.set, [key for recipe in recipes.values() for key in type(recipe).model_fields])
     tasks = [settings.change_scenario(name) for name in args.tasks or group_of_scenarios(BENCHMARK)]
     for name, recipe in recipes.items():
@@ -157,7 +174,7 @@ def read_jobs(args: argparse.Namespace) -> list[Job]:
         options = args.output.absolute(), args.episodes, args.list_seed, recipe, settings.texts
         jobs.append(Job(task, name, seed, args.decisions or DECISIONS, *options))
     if not jobs or len({job.folder for job in jobs}) < len(jobs):
-        raise InvalidInput("a run needs at least one seed, and each task and each method only once")
+        raise InvalidInput("a run needs at least one seed, and each task and each name of a method's file only once")
     return jobs
 
 
@@ -172,7 +189,8 @@ def run(args: argparse.Namespace) -> int:
         with on_ray(args.ray) if args.ray else nullcontext():
             for job, row in zip(jobs, run_each(((job.finish,) for job in jobs), args.jobs), strict=True):
                 rows.append(row)
-                print(f"{len(rows)} of {len(jobs)}: {job.name}: {row.get('reason') or 'finished'}", flush=True)
+                result = row.get("reason") or f"honest cost {float(row['honest_cost']):.2f}"
+                print(f"{len(rows)} of {len(jobs)}: {job.name}: {result}", flush=True)
         write_file(args.output / "rows.csv", csv_text(rows).encode())
     return sum("reason" in row for row in rows)
 

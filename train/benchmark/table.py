@@ -36,15 +36,28 @@ PERCENT = Column("", digits=1, scale=100.0, unit=" %")
 
 
 def read_rows(files: Iterable[Path]) -> Cells:
-    """Rows by task and method. Raises `InvalidInput` for rows of other worlds or physics than the task's first row."""
+    """Rows by task and method.
+
+    Raises `InvalidInput` for a file without the columns, rows of other worlds or physics than the task's first row,
+    two rows of one seed, and rows of a method with other decisions or another version than its first row.
+    """
     cells: Cells = defaultdict(list)
     worlds: dict[str, tuple[str, str]] = {}
     for file in sorted(files):
         for row in csv.DictReader(file.read_text().splitlines()):
+            if missing := [name for name in ("task", "worlds_sha256", *MEANS) if name not in row]:
+                raise InvalidInput(f"{file}: lacks the column {missing[0]}; must have rows of run.py or of evaluate")
             identity = row["worlds_sha256"], row["physics_digest"]
             if worlds.setdefault(row["task"], identity) != identity:
                 raise InvalidInput(f"{file}: {row['task']}: has other worlds or another physics than other files")
-            cells[row["task"], row.get("method") or row["agent"]].append(row)
+            cell = cells[row["task"], row.get("method") or row["agent"]]
+            where = f"{file}: {row['task']}, {row.get('method') or row['agent']}"
+            if any(other.get("seed") == row.get("seed") for other in cell):
+                raise InvalidInput(f"{where}: another row has the same seed; leave one of them out")
+            for name in ("decisions", "version"):
+                if cell and cell[0].get(name) != row.get(name):
+                    raise InvalidInput(f"{where}: {name} = {row.get(name)}, but {cell[0].get(name)} in another row")
+            cell.append(row)
     return cells
 
 
@@ -64,7 +77,7 @@ def scale_of(cells: Cells, task: str) -> tuple[float, float]:
     """Honest cost of full braking and best known honest cost of a task. Raises `InvalidInput` without `full_brake`."""
     if (task, "full_brake") not in cells:
         raise InvalidInput(f"{task}: has no row of full_brake, which has the scale; add the file of its evaluation")
-    (row,) = cells[task, "full_brake"]
+    row = cells[task, "full_brake"][0]
     return float(row["honest_cost"]), float(row["best_known_honest"])
 
 
