@@ -69,11 +69,11 @@ def test_objectives__are_measured_in_every_count_and_once_unless_vehicles_differ
 
 
 def test_worst5__is_the_mean_of_the_worst_worlds_in_every_count() -> None:
-    result = eb.evaluate("paper-random", "full_brake", episodes=40, measures="worst5", harm_count="honest")
+    result = eb.evaluate("paper-random", "full_brake", episodes=100, measures="worst5", harm_count="honest")
     (row,) = eb.summarise(result)
     for count, column in COLUMN.items():
-        last_two = np.sort(result["full_brake"][column])[-2:]
-        assert row[f"worst5_{count}"].value == pytest.approx(last_two.mean()) and row[f"worst5_{count}"].interval
+        last_five = np.sort(result["full_brake"][column])[-5:]
+        assert row[f"worst5_{count}"].value == pytest.approx(last_five.mean()) and row[f"worst5_{count}"].interval
 
 
 def test_pushing__is_where_vehicle_1_ends_minus_where_it_would() -> None:
