@@ -89,7 +89,7 @@ if TYPE_CHECKING:
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError, MissingExtra as MissingExtra
 
-__version__ = "1.0.0"
+__version__ = "2.0.0"
 
 
 _HOMES = names_behind(__file__)
