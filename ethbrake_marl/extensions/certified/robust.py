@@ -3,7 +3,7 @@
 It is the step shield with one change: the price of a plan is its largest harm over all *members* of a world, which are
 the nominal world and the corners (``uncertainty``). The members are simulated in parallel with the episode, with the
 applied actions, by the episode's own step; so the proof of the step shield holds in each of them. It does not hold
-between the corners (docs/proofs/shield.md).
+between the corners (docs/shield.md).
 """
 
 from __future__ import annotations
