@@ -76,7 +76,7 @@ html_show_sourcelink = False
 copybutton_prompt_text = "$ "
 copybutton_only_copy_prompt_lines = True
 
-# Pages that the site makes from other files: README, cards of policies, help texts, tables of the reproduction.
+# Pages that the site makes from other files: README, changelog, cards of policies, help texts, the reproduction.
 
 LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
@@ -90,7 +90,7 @@ def relink(text: str, docname: str, folder: Path) -> str:
             return found[0]
         if path.name == "card.md":
             path, anchor = DOCS / "reference" / "policies.md", f"#{path.parent.name}"
-        pages = {ROOT / "README.md": "index.md", ROOT / "CHANGELOG.md": "changelog.md"}
+        pages = {ROOT / "README.md": "index.md", ROOT / "CHANGELOG.md": "decisions/README.md"}
         return f"]({os.path.relpath(DOCS / pages.get(path, path), (DOCS / docname).parent)}{anchor})"
 
     return LINK.sub(lead, text)
@@ -141,6 +141,12 @@ def reproduction() -> str:
     return "## Tables\n\n" + "\n\n".join(blocks)
 
 
+def changes() -> str:
+    """The changelog, its headings one level lower."""
+    text = relink((ROOT / "CHANGELOG.md").read_text("utf-8"), "decisions/README", ROOT)
+    return re.sub(r"(?m)^#(?=#* )", "##", text)
+
+
 def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Complete the pages that are made, and lead links that leave docs/ to their page on the site."""
     text = relink(source[0], docname, (DOCS / docname).parent)
@@ -148,6 +154,8 @@ def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
         text = first_page()
     elif docname == "reference/cli":
         text += "\n" + commands()
+    elif docname == "decisions/README":
+        text += "\n" + changes()
     elif docname == "paper":
         text += "\n" + reproduction()
     elif docname == "reference/policies":

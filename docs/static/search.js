@@ -17,6 +17,6 @@ var Scorer = {
       if (pages === page || (Array.isArray(pages) && pages.includes(page))) score += 10;
       if (word.length > 2 && titles[page].toLowerCase().includes(word)) score += 10;
     }
-    return /^(changelog|index|decisions|code|proofs|results|reference\/cli)/.test(name) ? score - 20 : score;
+    return /^(index|decisions|code|proofs|results|reference\/cli)/.test(name) ? score - 20 : score;
   },
 };

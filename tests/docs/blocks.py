@@ -52,7 +52,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 GROUPS = {f"ethbrake_marl.{each.group}" for each in registries()}
 COMMENT = re.compile(r"<!-- block: (.*) -->\s*", re.DOTALL)
 MARK = re.compile(r"(slow$|not run: |needs |short(?: |$)|except |write |show |change |without )(.*)")
-NO_CODE = ("text", "bibtex", "{include} ../CHANGELOG.md")
+NO_CODE = ("text", "bibtex")
 TINY = "--steps 1 --set evaluation.worlds=10 --set n_envs=16 --set tried=16"
 SHORT = {  # what is added to a command, the first that fits: the last value of an option counts
     "ethbrake train --recipe rollout-classification": f"{TINY} --set gradient_steps=1",

@@ -21,6 +21,7 @@ DOORS = {
     "SB3": eb.make_sb3_vec_env,
 }
 USUAL = eb.View().features
+USUAL_ROWS = tuple(feature for feature in USUAL if not feature.name.startswith("rear_1."))
 TEXT = """# The environment: {gymnasium}
 
 What an agent sends and receives. This page is made from the code by `python -m
@@ -43,39 +44,36 @@ for one time step, usually 0.1 s. With `actions=K`, an index of K evenly spaced 
 ## Observation
 
 By default these {count} numbers, in this order. An observed number is the quantity divided by *scale*,
-clipped to *bounds*. **All numbers of a neighbour that the vehicle does not know are 0**: before its own
-latency has elapsed, before it sees the neighbour or receives its first message, or if there is none.
+clipped to *bounds*. **All numbers of a neighbour that the vehicle does not know are 0**
+([who knows what](../cooperation.md#who-knows-what-and-when)).
 
 {usual}
 
-`front_2` to `front_64` and `rear_2` to `rear_64` have the same numbers as `front_1`, for vehicles
-farther away. More numbers, which `observation=[...]` or a scenario chooses, by name or by group:
+`rear_1`, the vehicle behind, follows with the same numbers as `front_1`, the vehicle ahead. `front_2`
+to `front_64` and `rear_2` to `rear_64` are vehicles farther away. More numbers, which
+`observation=[...]` or a scenario chooses, by name or by group:
 
 {more}
 
 ## Reward
 
-The default, for every vehicle: minus the harm of the step, `r = - sum w^2` over the first impacts of
-all pairs in the step, with the closing speed `w` in m/s before the impact. In general
-`r = sum weight x term`:
+By default `r = - sum w^2` for every vehicle, over the first impacts of all pairs in the step, with the
+closing speed `w` in m/s. In general `r = sum weight x term`:
 
 {rewards}
 
 {terms}
 
-`harm_count` is `first` (first impact of each pair), `total` (every impact) or `honest` (total harm and
-the [price of conduct](../game.md#the-honest-cost)). Rewards are large before a policy has learned
+[Counts of harm](../game.md#three-counts-of-harm). Rewards are large before a policy has learned
 anything (honest cost of random actions on `paper-random`: about 550 m²/s² an episode; full braking:
 31), so most learners need a scale, for instance `reward={{"harm": 0.05, "harm_count": "honest"}}`.
 
 ## Start and end
 
-- **Start**: at the alert Vehicle 1 brakes. `reset` returns the observation at the moment when the
-  latency of the first learner has elapsed. `reset(seed=s)` starts the first training world of seed
-  s, `reset()` the next one; [`options`](../environments.md#episodes-and-seeds) choose a world.
-- **Terminated**: every vehicle is at rest, and no command would move it.
-- **Truncated**: at the scenario's `horizon_s` (usually 8 s), or after `max_cycles` steps.
-  All vehicles end together.
+`reset` returns the observation at the moment when the latency of the first learner has elapsed. An
+episode is *terminated* for all vehicles when every vehicle is at rest and no command would move it, and
+*truncated* at the scenario's `horizon_s` (usually 8 s), or after `max_cycles` steps. [Seeds and
+options](../environments.md#episodes-and-seeds).
 
 ## Infos
 
@@ -124,7 +122,11 @@ def more_features() -> list[list[str]]:
     """Rows of all features outside the default, without those of neighbours farther away."""
     rows = feature_rows(eb.View(["role", "obstacle"]).features)
     singles = [name if name in known_names() else f"front_1.{name}" for name in FEATURES]
-    rows += feature_rows(eb.View(singles).features)
+    flags = [name for name in singles if name.endswith("_known")]
+    rows += feature_rows(eb.View([name for name in singles if name not in flags]).features)
+    first, *others = feature_rows(eb.View(flags).features)
+    names = ", ".join(row[0] for row in (first, *others))
+    rows.append([names, "1 if this number is known, from a message or from sensors", *first[2:]])
     for name in GROUPS:
         count = len(eb.View([name]).features)
         forecast = "the braking of least forecast cost, and what follows" if name == "plan" else "the next impacts"
@@ -169,7 +171,7 @@ def page() -> str:
         action=env.action_space,
         observation=f"Box({env.observation_space.shape}, {env.observation_space.dtype})",
         count=len(USUAL),
-        usual=table(["number", "meaning", "unit", "scale", "bounds", "0 means"], feature_rows(USUAL)),
+        usual=table(["number", "meaning", "unit", "scale", "bounds", "0 means"], feature_rows(USUAL_ROWS)),
         more=table(["number", "meaning", "unit", "scale", "bounds", "0 means"], more_features()),
         rewards=table(["reward", "weights", "`harm_count`"], rewards),
         terms=table(["term", "value in a step", "unit"], [[f"`{n}`", m, u] for n, (u, m) in BUILT_IN.items()]),

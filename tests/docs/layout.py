@@ -11,9 +11,8 @@ PACKAGE = ROOT / "ethbrake_marl"
 PAGE = ROOT / "docs" / "code.md"
 BEGINNING = """## Every folder
 
-The core has everything that the paper's environment, training, scenarios and levels of cooperation
-need. A folder or file imports only from its own folder or from the lines below it; `make lint` checks
-this. `python -m tests.docs.layout` makes this list from the code.
+A folder or file imports only from its own folder or from the rows below it; `make lint` checks this.
+`python -m tests.docs.layout` makes this list from the code.
 """
 END = """
 `scenarios/` has one YAML file for each scenario, `train/` one for each recipe; those of an extension
@@ -69,26 +68,16 @@ def table(rooms: list[list[str]], inside: str = "") -> list[str]:
 def page() -> str:
     core = [[room for room in layer if not room.startswith("__")] for layer in layers("ethbrake_marl")]
     core = [[room for room in layer if room != "extensions"] for layer in core]
-    drawing = [" · ".join(layer) for layer in core if layer]
     extensions = layers("ethbrake_marl.extensions")
-    beside = [" · ".join(layer) for layer in extensions]
     return "\n".join(
         [
             PAGE.read_text("utf-8").partition(BEGINNING.partition("\n")[0])[0] + BEGINNING,
-            "```text",
-            *drawing,
-            "```",
-            "",
             *table([layer for layer in core if layer]),
             "\n### Extensions\n",
             "An extension is a folder whose table `parts.py` says what it adds; [no module of the core names",
             "it](decisions/README.md#the-core-never-names-an-extension). It may use the core and the extensions in",
-            "the lines below it. To delete one, delete its folder, its folder in `tests/extensions/`, and every",
+            "the rows below it. To delete one, delete its folder, its folder in `tests/extensions/`, and every",
             "extension that uses it.\n",
-            "```text",
-            *beside,
-            "```",
-            "",
             *table(extensions, "extensions"),
             END,
         ]
