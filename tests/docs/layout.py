@@ -54,12 +54,11 @@ def layers(folder: str) -> list[list[str]]:
     return [[room.strip("()") for room in layer.split(" | ")] for layer in contract["layers"]]
 
 
-def table(rooms: list[list[str]], inside: str = "") -> list[str]:
-    """A table of rooms: their files, and what they are."""
-    folder = PACKAGE / inside
-    lines = [f"| in `{folder.relative_to(ROOT).as_posix()}/` | what it holds |", "|---|---|"]
+def table(rooms: list[list[str]]) -> list[str]:
+    """A table of rooms of the core: their files, and what they are."""
+    lines = ["| in `ethbrake_marl/` | what it holds |", "|---|---|"]
     for room in (room for layer in rooms for room in layer):
-        place = folder / room
+        place = PACKAGE / room
         path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
         lines.append(f"| `{room}{'/' if place.is_dir() else '.py'}` | {first_sentence(path)} |")
     return lines
@@ -76,9 +75,11 @@ def page() -> str:
             "\n### Extensions\n",
             "An extension is a folder whose table `parts.py` says what it adds; [no module of the core names",
             "it](decisions/README.md#the-core-never-names-an-extension). It may use the core and the extensions in",
-            "the rows below it. To delete one, delete its folder, its folder in `tests/extensions/`, and every",
-            "extension that uses it.\n",
-            *table(extensions, "extensions"),
+            "the lines below it; the docstring of its folder says what it holds. To delete one, delete its folder, its",
+            "folder in `tests/extensions/`, and every extension that uses it.\n",
+            "```text",
+            *(" · ".join(layer) for layer in extensions),
+            "```",
             END,
         ]
     )

@@ -84,15 +84,15 @@ INTERFACES = "eb.env(), eb.parallel_env(), eb.EthBrakeEnv(), eb.EthBrakeVectorEn
 ABSENT = "assert not {'torch', 'stable_baselines3', 'tensorboard'} & set(sys.modules)"
 
 
-def readme_example() -> Call:
-    """First Python program of the README as a call."""
-    found = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
+def first_program() -> Call:
+    """First Python program of the page on environments as a call."""
+    found = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "environments.md").read_text("utf-8"), re.DOTALL)
     return Call(("python", "-c", found[1]))
 
 
 def calls() -> Iterator[Call]:
     """Yield all commands that are tried with the light core, in order."""
-    yield readme_example()
+    yield first_program()
     yield Call(("python", "-W", "error", "-c", f"import sys, ethbrake_marl as eb; {INTERFACES}; {ABSENT}"))
     yield from COMMANDS
 
@@ -129,7 +129,7 @@ def light(folder: Path) -> Cases:
     yield "light: what is installed", size
     yield from ((f"light: {call.shown}", partial(run, call, there, folder / "work")) for call in calls())
     yield "light: what the sdist brings", same
-    for call in (readme_example(), *SMOKE):
+    for call in (first_program(), *SMOKE):
         yield f"light, from the sdist: {call.shown}", partial(run, call, there, folder / "work")
 
 
