@@ -67,7 +67,7 @@ def watch_command(
                 show_in_window(films)
                 return
             except (InvalidInput, MissingExtra) as error:
-                out.note(f"no window: {error}")
+                out.note(str(error))
             out.check(Path(DEFAULT_FILE))
         path = output or Path(DEFAULT_FILE)
         what = "pictures" if path.suffix.lower() == ".png" else "film"

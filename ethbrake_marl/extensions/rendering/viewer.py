@@ -151,7 +151,7 @@ class Screen:
             self.window = self.pygame.Window("EthBrake", frame.shape[1::-1])
         except self.pygame.error as error:
             raise InvalidInput(
-                f"render_mode = 'human': cannot open a window ({error}); use 'rgb_array', which needs no display"
+                f"cannot open a window ({error}); render_mode = 'rgb_array' and film files need no display"
             ) from None
 
     def show(self, frame: Any, fps: int) -> bool:

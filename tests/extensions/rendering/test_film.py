@@ -85,7 +85,7 @@ def test_watch__without_a_file_opens_a_window_or_writes_one(
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
     answer = ethbrake("watch", "--agents", "coast")
-    assert answer.status == 0 and "cannot open a window" in answer.err and "film: watch.gif" in answer.err
+    assert answer.status == 0 and answer.err.startswith("cannot open a window (") and "film: watch.gif" in answer.err
     assert Path("watch.gif").stat().st_size > 1e5
 
 

@@ -168,7 +168,7 @@ def test_human__shows_each_step_in_real_time(monkeypatch: pytest.MonkeyPatch) ->
     other.close()
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
-    with pytest.raises(InvalidInput, match=r"cannot open a window .*; use 'rgb_array', which needs no display"):
+    with pytest.raises(InvalidInput, match=r"cannot open a window .*; render_mode = 'rgb_array' and film files"):
         EthBrakeParallelEnv(render_mode="human").reset(seed=0)
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(MissingExtra, match=r"pip install 'ethbrake-marl\[render\]'"):
