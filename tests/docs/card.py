@@ -87,11 +87,7 @@ The same keys after a reset and after every step:
 
 ## Versions
 
-- `EthBrake-v2`: the honest cost prices the engine's force and charges a push to its author; an end
-  after `max_cycles` is known to rewards; light vehicles with restitution 0 have all their impacts.
-- `EthBrake-v1`: in version 1.0 of this package.
-
-[The changelog](../../CHANGELOG.md) lists everything that changed.
+`EthBrake-v2`: [what has changed](../../CHANGELOG.md). `EthBrake-v1`: in version 1.0 of this package.
 """
 
 
