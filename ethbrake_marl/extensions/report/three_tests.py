@@ -19,7 +19,7 @@ TESTS = {
     "paper-random": "Main test: Vehicle 2 may drive, and there is no obstacle ahead of Vehicle 1. Neither first-impact"
     " nor total harm includes pushing Vehicle 1; the honest cost does.",
     "paper-random-brake-only": "Brake-only test: the same worlds, but Vehicle 2 may only brake and coast, so it cannot"
-    " push with its motor.",
+    " push with its engine.",
     "paper-random-obstacle": "Obstacle test: the same worlds with an obstacle 1.7 m beyond the place where Vehicle 1"
     " stops by itself. An impact of Vehicle 1 with the obstacle is harm.",
 }
