@@ -173,7 +173,7 @@ def process_sheet(settings: ReproductionSettings, reading: Reading, episodes: in
             values = {key: [seed[name][key].mean() for seed in seeds] for key in keys if key in seeds[0][name]}
             rows.append((name, *(mean(np.array(values[key])) if key in values else None for key in keys)))
     lengths = [f"{name}: {course.length}." for name, course in courses_of(settings, RANDOM).items()]
-    note = f"Time step {MAP_STEP_S:g} s. PPO and SAC: means over {len(seeds)} seeds with t intervals. Harm in m²/s²."
+    note = f"Time step {MAP_STEP_S:g} s. PPO and SAC: means over seeds with t intervals. Harm in m²/s²."
     note = " ".join([note, *lengths])
     return [Sheet(f"The {PAPERS} in its map, {episodes:,} worlds", ("Strategy", *TABLE_COLUMNS), rows, note)]
 

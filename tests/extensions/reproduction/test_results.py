@@ -226,7 +226,7 @@ def ppo_is_unconverged(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def process_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    course = Course([{k: -9.0 + min(k, 3) for k in range(9)}] * 2, [{100.0: 1.0}] * 2, 9_000.0, 7.0)
+    course = Course([{k: -9.0 + min(k, 3) for k in range(9)}] * 2, [{100.0: 1.0}] * 2, 9_000.0, 7.0, 9_000.0, 5)
     monkeypatch.setattr(
         strategies, "process", lambda settings: {name: [spec, spec] for name, spec in SHIPPED_SPECS.items()}
     )
@@ -241,7 +241,7 @@ def test_random_table__has_every_printed_number_and_the_papers_process() -> None
     assert len(claims) == 11 + 9 + 2 + 6 + 2 + 1 + 4 and len(printed.rows) == 4
     assert [row[0] for row in in_map.rows] == ["0.1 s", "0.2 s", "0.25 s", "0.3 s"]
     assert in_map.rows[1][2].value == pytest.approx(in_map.rows[1][1].value)  # as many worlds as in the list
-    length = "9,000 decisions, 7 CPU-s, last third +0.00 of 3.0"
+    length = "2 of 5 seeds, 9,000 decisions, 7 CPU-s, last third +0.00 of 3.0"
     assert claims["PPO by the process"][0].endswith(f"(PPO: {length})") and f"SAC: {length}." in process.note
     rate = claims["Non-E, collision rate"]
     assert rate == ("80.0 % [71.1, 86.7]", "96.0 % [90.2, 98.4], undecided", "differs")
@@ -255,7 +255,7 @@ def test_random_table__has_every_printed_number_and_the_papers_process() -> None
     assert [each.value for each in rows["PPO"][:3]] == pytest.approx(
         [driven["ppo"][key].mean() for key in ("collided", "first_impact_harm", "total_harm")]
     )
-    assert "over 2 seeds" in process.note
+    assert "means over seeds" in process.note
 
 
 @pytest.mark.usefixtures("ppo_is_unconverged")
