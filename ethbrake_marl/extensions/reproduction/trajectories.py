@@ -115,21 +115,7 @@ def reproduce_trajectories(settings: ReproductionSettings) -> Made:
                 ),
             }
         )  # fmt: skip
-    rows = [
-        (
-            *(name, str(number), policy, int(record.impacts.number.sum())),
-            *(
-                *map(float, (record.last.harm("first")[0], record.last.harm("total")[0])),
-                *map(float, record.gaps_m[-1]),
-            ),
-        )
-        for name, records in readings.items()
-        for (policy, number), record in records.items()
-    ]
-    numbers = ("Impacts", "First-impact harm", "Total harm", "Last gap 1 (m)", "Last gap 2 (m)")
-    note = f"One world each: no intervals. Exact physics; harm in m²/s². {settings.who_drives}"
-    sheet = Sheet("How the episodes end", ("Reading", "Scenario", "Policy", *map(Column, numbers)), rows, note)
-    return Made(claims_of(parts), [sheet], figures)
+    return Made(claims_of(parts), figures=figures, notes=[settings.who_drives])
 
 
 def reproduce_accelerations(settings: ReproductionSettings) -> Made:

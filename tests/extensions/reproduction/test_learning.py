@@ -11,7 +11,6 @@ import ethbrake_marl as eb
 from ethbrake_marl.extensions.reproduction import learning
 from ethbrake_marl.extensions.reproduction.learning import DENSE, HIGH, LOW, RANDOM, STOPPED, Course, TrainingPlan
 from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
-from ethbrake_marl.extensions.reproduction.readings import STATED
 from ethbrake_marl.extensions.reproduction.tables import process_sheet
 from ethbrake_marl.extensions.reproduction.trajectories import all_records
 from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less
@@ -217,7 +216,7 @@ def test_trainings__stop_and_continue(tiny: ReproductionSettings) -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_process__is_trained_once_in_the_papers_map_and_shown(tiny: ReproductionSettings) -> None:
-    assert process_sheet(tiny, STATED, 20) == []
+    assert process_sheet(tiny) == []
     assert learning.train_groups(tiny, [RANDOM])
     (seeds,) = learning.trained_runs(tiny.folder, RANDOM).values()
     assert learning.course_of(seeds, 2).seconds > 0.0 and len(seeds) == 2
@@ -231,7 +230,7 @@ def test_process__is_trained_once_in_the_papers_map_and_shown(tiny: Reproduction
     result = eb.evaluate(mapped, specs, episodes=20)
     harm = [result[spec]["first_impact_harm"].mean() for spec in specs]
     assert harm[0] != harm[1]  # other seeds
-    (row,) = (row for row in process_sheet(tiny, STATED, 20)[0].rows if row[0] == "PPO")
+    (row,) = (row for row in process_sheet(tiny)[0].rows if row[0] == "PPO")
     assert row[2].value == pytest.approx(np.mean(harm))
     assert [*all_records(replace(tiny, policies={"PPO": "coast"}))["paper's process"]] == [("PPO", 1), ("PPO", 2)]
     assert "paper's process" not in all_records(tiny)  # there is no SAC beside PPO
