@@ -48,9 +48,10 @@ def reproduce_command(
     """Reproduce the paper's results, and compare ours with them.
 
     The command prints how long the work takes, and then one table: each number and statement of the paper, ours, our
-    verdict and a reason. Shipped policies drive; only a policy that has not converged is trained. It writes a page
-    (README.md) with this table and all items, and figures (SVG, PDF) and tables (CSV) of each. An item is a
-    figure or a table of the paper. After an interruption, repeat the command: trainings go on where they were.
+    verdict and a reason. Shipped policies drive; only a policy that has not converged is trained. Trainings of an
+    earlier --full in the folder are shown, with their number of seeds. The command writes a page (README.md) with this
+    table and all items, and figures (SVG, PDF) and tables (CSV) of each. An item is a figure or a table of the paper.
+    After an interruption, repeat the command: trainings go on where they were.
     """
     with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_REPRODUCTION) as out:
         from ethbrake_marl.extensions.reproduction import items

@@ -203,13 +203,15 @@ def process_claims(settings: ReproductionSettings, groups: Groups, rivals: Seque
     """Verdict for each algorithm of the paper's process: it does less harm than ``rivals`` in each group of worlds."""
     claims = []
     for policy, course in courses_of(settings, RANDOM).items():
-        parts = []
-        for group, (lines, rows) in groups.items():
-            harm = lines[policy][:, rows].mean(axis=1)  # [seeds]
-            for rival in rivals:
-                least = lines[rival][rows].mean()
-                both_are_0 = not harm.any() and least == 0.0
-                parts.append(Less(f"{policy} minus {rival}, {group}", mean(harm - least), both_are_0))
+        parts = [
+            Less(
+                f"{policy} minus {rival}, {group}",
+                mean(lines[policy][:, rows].mean(axis=1) - lines[rival][rows].mean()),
+                not (lines[policy][:, rows].any() or lines[rival][rows].any()),
+            )
+            for group, (lines, rows) in groups.items()
+            for rival in rivals
+        ]
         claims.append(judge_trained(f"{policy} by the process", {policy: course}, parts))
     return claims
 

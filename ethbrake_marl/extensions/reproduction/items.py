@@ -27,6 +27,7 @@ from ethbrake_marl.extensions.reproduction.learning import (
     reproduce_curves,
     seconds_left,
     train_groups,
+    trained_runs,
 )
 from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, DrawnFigure, Item, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS
@@ -103,7 +104,7 @@ RESULTS_FILE = "README.md"
 
 PAPER = "*How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning*"
 
-QUICK_NOTE = "Figures 2 and 3 and the paper's own process need --full."
+QUICK_NOTE = "Rows that were not run need --full, or trainings of an earlier --full in the same folder."
 SENTENCES = "## The paper, sentence by sentence"
 
 
@@ -122,8 +123,8 @@ def groups_of(settings: ReproductionSettings, items: Sequence[Item]) -> list[str
 
 def cost(settings: ReproductionSettings, items: Sequence[Item]) -> str:
     training_s = seconds_left(settings.folder, groups_of(settings, items))
-    more_s = {item.name: PROCESS_S for item in items if RANDOM in item.trained}
-    seconds = sum(item.most_s + (more_s.get(item.name, 0.0) if settings.full else 0.0) for item in items)
+    process_s = PROCESS_S if settings.full or trained_runs(settings.folder, RANDOM) else 0.0
+    seconds = sum(item.most_s + process_s * (RANDOM in item.trained) for item in items)
     text = f"to do: {count_of(len(items), 'item')}, at most about {seconds:.0f} s of one core"
     return f"{text}; trainings before them about {training_s / 60.0:.1f} min of one core" if training_s else text
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from ethbrake_marl.motion.layout import Floats
 
 RANDOM, HIGH, LOW, STOPPED, DENSE = "random", "high", "low", "stopped", "dense"
 STATUS = "run.json"  # file with the status of a run
+FEWEST_EVALUATIONS = 6  # of a stopped training that is shown
 
 
 class TrainingPlan(NamedTuple):
@@ -60,17 +61,30 @@ def runs_of(folder: Path, group: str, plan: TrainingPlan) -> list[Path]:
 
 
 def is_finished(run: Path) -> bool:
-    status = run / STATUS
-    return status.is_file() and read_object(status).get("status") == "finished"
+    return read_status(run).get("status") == "finished"
 
 
-def finished_runs(folder: Path, group: str) -> dict[str, list[Path]]:
-    """Folders of the finished trainings in a group, such as ``RANDOM``: recipe -> one folder for each seed.
+def is_stopped(run: Path) -> bool:
+    """Whether Ctrl-C stopped the run, after enough measurements for a learning curve."""
+    status = read_status(run)
+    return status.get("status") == "interrupted" and len(status["evaluations"]) >= FEWEST_EVALUATIONS
 
-    A recipe is left out unless the trainings of all its seeds are finished.
+
+def read_status(run: Path) -> dict[str, Any]:
+    return read_object(run / STATUS) if (run / STATUS).is_file() else {}
+
+
+def trained_runs(folder: Path, group: str) -> dict[TrainingPlan, list[Path]]:
+    """Trainings of a group, such as ``RANDOM``, that ``folder`` has: plan -> one folder of a run for each seed.
+
+    A plan has the finished trainings or, if none is finished, the stopped ones. It is left out if it has neither.
     """
-    runs_of_recipe = {plan.recipe: runs_of(folder, group, plan) for plan in TRAINING_GROUPS[group]}
-    return {recipe: runs for recipe, runs in runs_of_recipe.items() if all(map(is_finished, runs))}
+    trained = {}
+    for plan in TRAINING_GROUPS[group]:
+        runs = runs_of(folder, group, plan)
+        if counted := [*filter(is_finished, runs)] or [*filter(is_stopped, runs)]:
+            trained[plan] = counted
+    return trained
 
 
 def seconds_left(folder: Path, groups: Iterable[str]) -> float:
@@ -114,19 +128,17 @@ def unconverged_policy(folder: Path) -> str:
 
     It stands for the paper's policy "obtained from training before convergence occurred".
     """
-    ((run,),) = finished_runs(folder, STOPPED).values()
+    ((run,),) = trained_runs(folder, STOPPED).values()
     return f"policy@{run / 'policy-last'}"
 
 
 def process(settings: ReproductionSettings) -> dict[str, list[str]]:
     """Agent names of policies of the group ``RANDOM``: ``PPO`` and ``SAC`` -> one agent name for each seed.
 
-    Empty unless ``settings.full``. An algorithm with an unfinished training is left out.
+    An algorithm without a training is left out.
     """
-    runs = finished_runs(settings.folder, RANDOM) if settings.full else {}
-    return {
-        name: [f"policy@{run / 'policy'}" for run in runs[recipe]] for recipe, name in NAMES.items() if recipe in runs
-    }
+    trained = trained_runs(settings.folder, RANDOM)
+    return {NAMES[plan.recipe]: [f"policy@{run / 'policy'}" for run in runs] for plan, runs in trained.items()}
 
 
 NAMES = {"ppo-paper": "PPO", "sac-paper": "SAC"}
@@ -143,8 +155,10 @@ class Course(NamedTuple):
 
     returns: LearningCurves  # mean return of training episodes
     harm: LearningCurves  # first-impact harm in a fixed list of worlds (m2/s2)
-    decisions: float = 100.0  # of the whole training
+    decisions: float = 100.0  # of a training
     seconds: float = 0.0  # processor time of a training, mean over seeds
+    planned_decisions: float = 0.0
+    planned_seeds: int = 1
 
     @property
     def values(self) -> Floats:
@@ -174,18 +188,25 @@ class Course(NamedTuple):
 
     @property
     def is_converged(self) -> bool:
-        """Whether the ``improvement`` is at most 2 % of the mean ``rise``.
+        """Whether the training is complete, and the ``improvement`` at most 2 % of the mean ``rise``.
 
         The last quarter alone cannot show it: the learning rate falls, so every training is calm in the end.
         """
-        return self.improvement <= VERDICT_TOLERANCE * float(self.rise.mean())
+        complete = self.decisions >= self.planned_decisions
+        return complete and self.improvement <= VERDICT_TOLERANCE * float(self.rise.mean())
+
+    @property
+    def has_interval(self) -> bool:
+        """Whether seeds show chance: at least two are trained, or the plan has only one."""
+        return min(self.planned_seeds, 2) <= len(self.returns)
 
     @property
     def length(self) -> str:
-        """Length of a training and its convergence, in words."""
+        """Number of seeds, length of a training and its convergence, in words."""
+        of = f" of {self.planned_decisions:,.0f}" if self.decisions < self.planned_decisions else ""
         return (
-            f"{self.decisions:,.0f} decisions, {self.seconds:,.0f} CPU-s, last third {self.improvement:+.2f} of"
-            f" {self.rise.mean():.1f}"
+            f"{len(self.returns)} of {self.planned_seeds} seeds, {self.decisions:,.0f}{of} decisions,"
+            f" {self.seconds:,.0f} CPU-s, last third {self.improvement:+.2f} of {self.rise.mean():.1f}"
         )
 
     @property
@@ -219,45 +240,46 @@ def column(run: Path, name: str) -> dict[float, float]:
     return {float(row["steps"]): float(row[name]) for row in rows if row.get(name)}
 
 
-def course_of(runs: Sequence[Path]) -> Course:
-    returns, harm = ([column(run, name) for run in runs] for name in (RETURN, HARM))
-    shared = set.intersection(*map(set, returns))
-    last, seconds = max(harm[0]), [read_object(run / STATUS)["evaluations"][-1]["cpu_s"] for run in runs]
+def course_of(runs: Sequence[Path], planned_seeds: int) -> Course:
+    curves = [[column(run, name) for run in runs] for name in (RETURN, HARM)]
+    shared = [sorted(set.intersection(*map(set, of_seeds))) for of_seeds in curves]
+    last, seconds = shared[1][-1], [read_object(run / STATUS)["evaluations"][-1]["cpu_s"] for run in runs]
     returns, harm = (
-        [{100.0 * k / last: curve[k] for k in sorted(steps)} for curve in curves]
-        for curves, steps in ((returns, shared), (harm, harm[0]))
+        [{100.0 * k / last: curve[k] for k in steps if k <= last} for curve in of_seeds]
+        for of_seeds, steps in zip(curves, shared, strict=True)
     )
-    return Course(returns, harm, last, sum(seconds) / len(seconds))
+    planned_decisions = read_object(runs[0] / "config.json")["recipe"]["total_steps"]
+    return Course(returns, harm, last, sum(seconds) / len(seconds), planned_decisions, planned_seeds)
 
 
-def courses_of(settings: ReproductionSettings, delay: str) -> dict[str, Course]:
-    return {
-        NAMES[recipe]: course_of(runs)
-        for recipe, runs in (finished_runs(settings.folder, delay) if settings.full else {}).items()
-    }
+def courses_of(settings: ReproductionSettings, group: str) -> dict[str, Course]:
+    trained = trained_runs(settings.folder, group)
+    return {NAMES[plan.recipe]: course_of(runs, plan.seeds) for plan, runs in trained.items()}
 
 
 def judge_trained(name: str, courses: Mapping[str, Course], parts: Sequence[Less], *, numbers: str = "") -> Claim:
     """Claim with our verdict on a statement about policies that are trained by the paper's process.
 
-    The verdict is "not converged" unless all trainings have converged. ``courses``: the algorithms that the statement
-    is about. ``parts``, ``numbers``: as in ``judge``.
+    The verdict is "not converged" unless all trainings have converged, and "undecided" if one of several planned seeds
+    is trained. ``courses``: the algorithms that the statement is about. ``parts``, ``numbers``: as in ``judge``.
     """
     claim = judge(name, parts, numbers=numbers)
     lengths = "; ".join(f"{algorithm}: {course.length}" for algorithm, course in courses.items())
-    converged = all(course.is_converged for course in courses.values())
-    return claim._replace(ours=f"{claim.ours} ({lengths})", verdict=claim.verdict if converged else "not converged")
+    verdict = claim.verdict if all(course.has_interval for course in courses.values()) else "undecided"
+    if not all(course.is_converged for course in courses.values()):
+        verdict = "not converged"
+    return claim._replace(ours=f"{claim.ours} ({lengths})", verdict=verdict)
 
 
 def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
     """Fig. 2 or 3: learning curves at a high or low ``delay``, and the paper's statements about them.
 
-    No claim is made without finished trainings at both delays.
+    Statements that compare PPO and SAC need trainings of both at both delays.
     """
     courses = {level: courses_of(settings, level) for level in (HIGH, LOW)}
-    if not all(name in courses[level] for level in courses for name in NAMES.values()):
+    delay_courses, claims = courses[delay], list[Claim]()
+    if not delay_courses:
         return Made()
-    delay_courses = courses[delay]
     title = f"Learning curves at {delay} delay, the paper's process"
     text = f"{title}: return and harm against progress, mean over seeds; bands: one standard deviation."
     panels = {
@@ -275,9 +297,11 @@ def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
     ]
     note = "Harm: first-impact, m²/s², 1,000 worlds of seed 1007. Return: of the last tenth. t intervals over seeds."
     columns = ("Algorithm", Column("Seeds"), "Length", Column("Last policy, harm"), Column("Last return"))
-    claims = claims_at_high_delay(courses[HIGH]) if delay == HIGH else claims_at_low_delay(courses[HIGH], courses[LOW])
-    if delay == LOW:
-        claims += reward_claims(courses[LOW]["PPO"], courses_of(settings, DENSE))
+    if all(len(courses[level]) == len(NAMES) for level in courses):
+        high, low = courses.values()
+        claims += claims_at_high_delay(high) if delay == HIGH else claims_at_low_delay(high, low)
+    if delay == LOW and "PPO" in delay_courses:
+        claims += reward_claims(delay_courses["PPO"], courses_of(settings, DENSE))
     return Made(claims, [Sheet(title, columns, rows, note)], [figure])
 
 

@@ -9,7 +9,7 @@ from typing import get_args
 import numpy as np
 
 from ethbrake_marl.evaluation.statistics import decrease, mean, rate, unpaired_difference
-from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, PaperRow, printed_sheet
+from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, PaperRow
 from ethbrake_marl.extensions.reproduction.learning import RANDOM, courses_of, judge_trained, unconverged_policy
 from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.map_bound import collides_in_map
@@ -155,15 +155,15 @@ def outcomes_sheet(title: str, outcomes: Mapping[str, RandomOutcome], least: Flo
 TABLE_COLUMNS = PERCENT, *map(Column, ("First-impact harm", "Total harm", "Predicted harm"))
 
 
-def process_sheet(settings: ReproductionSettings, reading: Reading, episodes: int) -> list[Sheet]:
+def process_sheet(settings: ReproductionSettings) -> list[Sheet]:
     """Table of policies trained as in the paper, in its fixed-step map: means over seeds, with t intervals.
 
     The list has this table, or is empty if there are no such trainings.
     """
-    outcomes = process_outcomes(reading, episodes, settings)
+    outcomes = process_outcomes(STATED, settings.episodes, settings)
     if not outcomes:
         return []
-    mapped = strategies(reading._replace(step_s=MAP_STEP_S), episodes, {})
+    mapped = strategies(STATED._replace(step_s=MAP_STEP_S), settings.episodes, {})
     keys = "collided", "first", "total", PREDICTED
     rows = [
         (name, *(outcome[key].mean() if key in outcome else None for key in keys)) for name, outcome in mapped.items()
@@ -172,10 +172,9 @@ def process_sheet(settings: ReproductionSettings, reading: Reading, episodes: in
         for name in (policy, f"Hybrid {policy}"):
             values = {key: [seed[name][key].mean() for seed in seeds] for key in keys if key in seeds[0][name]}
             rows.append((name, *(mean(np.array(values[key])) if key in values else None for key in keys)))
-    lengths = [f"{name}: {course.length}." for name, course in courses_of(settings, RANDOM).items()]
-    note = f"Time step {MAP_STEP_S:g} s. PPO and SAC: means over {len(seeds)} seeds with t intervals. Harm in m²/s²."
-    note = " ".join([note, *lengths])
-    return [Sheet(f"The {PAPERS} in its map, {episodes:,} worlds", ("Strategy", *TABLE_COLUMNS), rows, note)]
+    lengths = " ".join(f"{name}: {course.length}." for name, course in courses_of(settings, RANDOM).items())
+    note = f"Time step {MAP_STEP_S:g} s. PPO and SAC: means over seeds with t intervals. Harm in m²/s². {lengths}"
+    return [Sheet(f"The {PAPERS} in its map", ("Strategy", *TABLE_COLUMNS), rows, note)]
 
 
 def harm_difference(outcomes: Mapping[str, RandomOutcome], smaller: str, *larger: str) -> list[Less]:
@@ -198,11 +197,13 @@ def compare_over_seeds(seeds: Sequence[Mapping[str, RandomOutcome]], smaller: st
 
     ``seeds``: for each seed, strategy -> outcome. ``smaller``, ``larger``: names of the two strategies.
     """
-    parts = []
-    for count, harm in (*HARMS.items(), ("collided", "collision rate")):
-        first, second = (np.array([seed[name][count].mean() for seed in seeds]) for name in (smaller, larger))
-        parts.append(Less(f"{smaller} minus {larger}, {harm}", mean(first - second)))
-    return parts
+    return [
+        Less(
+            f"{smaller} minus {larger}, {harm}",
+            mean(np.array([seed[smaller][count].mean() - seed[larger][count].mean() for seed in seeds])),
+        )
+        for count, harm in (*HARMS.items(), ("collided", "collision rate"))
+    ]
 
 
 def conclusions(outcomes: Mapping[str, RandomOutcome], policies: Iterable[str]) -> dict[str, list[Less]]:
@@ -334,8 +335,8 @@ def reproduce_random_table(settings: ReproductionSettings) -> Made:
     claims += [avoidance_claim(name, outcomes, nearest_outcomes) for name in policies]
     claims += [*world_claims(outcomes, policies, least), *deceleration_claims(episodes)]
     claims += [gradient_claim(outcomes, episodes), *contribution_claims(settings, episodes)]
-    sheets = [printed_sheet(RANDOM_TEST), outcomes_sheet("The random test, as stated", outcomes, least), in_map]
-    return Made(claims, [*sheets, *process_sheet(settings, STATED, episodes)], notes=[settings.who_drives])
+    sheets = [outcomes_sheet("The random test, as stated", outcomes, least), in_map, *process_sheet(settings)]
+    return Made(claims, sheets, notes=[settings.who_drives])
 
 
 def reproduce_hybrid_table(settings: ReproductionSettings) -> Made:
@@ -363,6 +364,5 @@ def reproduce_hybrid_table(settings: ReproductionSettings) -> Made:
         for reading_outcomes in (outcomes, nearest_outcomes)
     ]
     claims.append(judge("outperforms", *parts))
-    sheets = [printed_sheet(HYBRID_TEST), outcomes_sheet("The 5,000 worlds, as stated", outcomes, least)]
     note = "The paper does not describe its policy that has not converged; ours has had a fifteenth of its decisions."
-    return Made(claims, [*sheets, *process_sheet(settings, STATED, episodes)], notes=[note])
+    return Made(claims, [outcomes_sheet("The 5,000 worlds, as stated", outcomes, least)], notes=[note])

@@ -14,6 +14,7 @@ from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, ne
 from ethbrake_marl.extensions.reproduction.learning import process
 from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
+from ethbrake_marl.extensions.reproduction.strategies import PAPERS
 from ethbrake_marl.extensions.reproduction.verdicts import Claim
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
@@ -80,12 +81,13 @@ def all_records(settings: ReproductionSettings) -> dict[str, Records]:
     """Recorded episodes, reading -> (policy, scenario number) -> episode.
 
     Two readings: the paper's parameters as stated, and the interpretation of the paper whose results come nearest to
-    the printed ones. If policies were trained by the paper's process, also ``paper's process``: the first seed of each.
+    the printed ones. If all policies were trained by the paper's process, also ``paper's process``: the first seed of
+    each.
     """
     policies = tuple(settings.policies.items())
     records = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
     trained = tuple((name, specs[0]) for name, specs in process(settings).items())
-    return records | ({"paper's process": record_all(STATED, trained)} if trained else {})
+    return records | ({PAPERS: record_all(STATED, trained)} if len(trained) == len(policies) else {})
 
 
 def reproduce_trajectories(settings: ReproductionSettings) -> Made:
@@ -113,21 +115,7 @@ def reproduce_trajectories(settings: ReproductionSettings) -> Made:
                 ),
             }
         )  # fmt: skip
-    rows = [
-        (
-            *(name, str(number), policy, int(record.impacts.number.sum())),
-            *(
-                *map(float, (record.last.harm("first")[0], record.last.harm("total")[0])),
-                *map(float, record.gaps_m[-1]),
-            ),
-        )
-        for name, records in readings.items()
-        for (policy, number), record in records.items()
-    ]
-    numbers = ("Impacts", "First-impact harm", "Total harm", "Last gap 1 (m)", "Last gap 2 (m)")
-    note = f"One world each: no intervals. Exact physics; harm in m²/s². {settings.who_drives}"
-    sheet = Sheet("How the episodes end", ("Reading", "Scenario", "Policy", *map(Column, numbers)), rows, note)
-    return Made(claims_of(parts), [sheet], figures)
+    return Made(claims_of(parts), figures=figures, notes=[settings.who_drives])
 
 
 def reproduce_accelerations(settings: ReproductionSettings) -> Made:

@@ -29,6 +29,10 @@ def test_cost__counts_the_trainings_that_are_missing(ethbrake: Command, empty_fo
     assert "about 275.8 min" in ethbrake("reproduce", "trajectories", "--full", "--cost").err
     assert "trainings" not in ethbrake("reproduce", "gaps", "trajectories", "--cost").err
     assert not list(empty_folder.iterdir())
+    run = Path("runs/reproduction/trainings/random/ppo-paper-seed0")
+    run.mkdir(parents=True)
+    (run / "run.json").write_text('{"status": "finished"}')
+    assert "at most about 24 s" in ethbrake("reproduce", "gaps", "trajectories", "--cost").err  # 12 + 2 + 10
 
 
 def test_reproduce__writes_page_figures_and_tables(ethbrake: Command, empty_folder: Path) -> None:
@@ -40,7 +44,7 @@ def test_reproduce__writes_page_figures_and_tables(ethbrake: Command, empty_fold
     page = Path("out/README.md").read_text("utf-8")
     assert "Made by `ethbrake reproduce accelerations --episodes 3` on 20" in page
     assert f"version {result['version']}, physics {result['physics_digest']})" in page
-    assert "](accelerations/accelerations.svg)" in page and "need --full" in page
+    assert "](accelerations/accelerations.svg)" in page and "not run need --full" in page
     folder = Path("out/accelerations")
     for name in ("accelerations.svg", "accelerations.pdf", "commands-of-vehicle-2.csv"):
         assert (folder / name).stat().st_size > 200

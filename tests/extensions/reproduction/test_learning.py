@@ -10,8 +10,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.reproduction import learning
 from ethbrake_marl.extensions.reproduction.learning import DENSE, HIGH, LOW, RANDOM, STOPPED, Course, TrainingPlan
-from ethbrake_marl.extensions.reproduction.made import ReproductionSettings
-from ethbrake_marl.extensions.reproduction.readings import STATED
+from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.tables import process_sheet
 from ethbrake_marl.extensions.reproduction.trajectories import all_records
 from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less
@@ -49,9 +48,15 @@ def test_convergence__is_a_last_third_that_improves_by_2_percent_of_the_rise_at_
     assert (still.improvement, rested.improvement) == (6.0, 1.5)
     assert not still.is_converged and rested.is_converged
     assert course([0.0, 50.0, 90.0, 90.0, 70.0, 70.0]).is_converged
-    assert (
-        still._replace(decisions=2_000.0, seconds=31.4).length == "2,000 decisions, 31 CPU-s, last third +6.00 of 96.0"
-    )
+    three_runs = runs(0, 50, 90, 90, 96, 96, apart=0.0)._replace(decisions=2_000.0, seconds=31.4, planned_seeds=5)
+    assert three_runs.length == "3 of 5 seeds, 2,000 decisions, 31 CPU-s, last third +6.00 of 96.0"
+
+
+def test_convergence__needs_the_whole_training() -> None:
+    stopped = course([0.0, 50.0, 90.0, 90.0, 91.5, 91.5])._replace(decisions=2_000.0, planned_decisions=5_000.0)
+    assert not stopped.is_converged
+    assert stopped.length.startswith("1 of 1 seeds, 2,000 of 5,000 decisions, ")
+    assert stopped._replace(planned_decisions=2_000.0).is_converged
 
 
 def test_no_verdict__rests_on_a_training_that_still_improves() -> None:
@@ -61,6 +66,17 @@ def test_no_verdict__rests_on_a_training_that_still_improves() -> None:
     claim = learning.judge_trained("x", {"PPO": rested, "SAC": still}, less)
     assert claim.verdict == "not converged"
     assert claim.ours == f"holds: a, -1.00 [-2.00, -0.50] (PPO: {rested.length}; SAC: {still.length})"
+
+
+def test_no_verdict__rests_on_one_of_several_seeds() -> None:
+    rested, less = course([0, 50, 90, 90, 91, 91]), [Less("a", Estimate(-1.0, None))]
+    assert learning.judge_trained("x", {"PPO": rested}, less).verdict == "agrees"
+    one_of_five = rested._replace(planned_seeds=5)
+    assert learning.judge_trained("x", {"PPO": one_of_five, "SAC": rested}, less).verdict == "undecided"
+    still = one_of_five._replace(planned_decisions=1e6)
+    assert learning.judge_trained("x", {"PPO": still}, less).verdict == "not converged"
+    two = runs(0, 50, 90, 90, 91, 91)._replace(planned_seeds=5)
+    assert learning.judge_trained("x", {"PPO": two}, less).verdict == "agrees"
 
 
 def test_statements__by_planted_courses() -> None:
@@ -103,37 +119,54 @@ def test_reward__with_and_without_its_terminal_part() -> None:
     assert terminal.ours.startswith("does not hold: harm 3.00 with it, 2.00 without (with: ")
 
 
-def plant(run: Path, end: float, status: str = "finished") -> None:
-    """A run whose harm falls to ``end``; its table has the return in every row, and the harm in some."""
+def plant(run: Path, end: float, status: str = "finished", rows: int = 4, planned: int = 2_000) -> None:
+    """A run with 500 decisions a row whose harm falls to ``end``; each row has the return, and some the harm."""
     run.mkdir(parents=True)
-    (run / "run.json").write_text(json.dumps({"status": status, "evaluations": [{"cpu_s": end}]}))
-    rows = [f"{500 * k},{-9.0 + k},{'' if k % 2 else end + 4.0 - k}" for k in range(1, 5)]
+    (run / "run.json").write_text(json.dumps({"status": status, "evaluations": [{"cpu_s": end}] * 6}))
+    (run / "config.json").write_text(json.dumps({"recipe": {"total_steps": planned}}))
+    rows = [f"{500 * k},{-9.0 + k},{'' if k % 2 else end + 4.0 - k}" for k in range(1, rows + 1)]
     (run / "progress.csv").write_text("\n".join([f"steps,{learning.RETURN},{learning.HARM}", *rows]))
 
 
 def test_curves__have_the_columns_of_the_runs(tmp_path: Path) -> None:
-    full = ReproductionSettings(tmp_path, full=True)
+    settings = ReproductionSettings(tmp_path)
     for delay in (HIGH, LOW):
         for number, plan in enumerate(learning.TRAINING_GROUPS[delay]):
             for seed, run in enumerate(learning.runs_of(tmp_path, delay, plan)):
                 plant(run, 10.0 * number + seed)
-    made = learning.reproduce_curves(HIGH, full)
+    made = learning.reproduce_curves(HIGH, settings)
     assert [row[:2] for row in made.sheets[0].rows] == [("PPO", 3), ("SAC", 3)]
     assert [[cell.value for cell in row[3:]] for row in made.sheets[0].rows] == [[1.0, -5.0], [11.0, -5.0]]
-    assert made.sheets[0].rows[1][2].startswith("2,000 decisions, 11 CPU-s, last third +1.00")
+    assert made.sheets[0].rows[1][2].startswith("3 of 3 seeds, 2,000 decisions, 11 CPU-s, last third +1.00")
     assert {claim.verdict for claim in made.claims} == {"not converged"}
     assert [claim.name for claim in made.claims] == ["steady", "alike", "PPO suits"]
     returns, harm = made.figures[0].figure.axes
     assert returns.lines[0].get_xdata().tolist() == [25.0, 50.0, 75.0, 100.0]
     assert harm.lines[1].get_ydata().tolist() == [13.0, 11.0] and harm.get_xlabel() == "Training progress (%)"
-    (learning.runs_of(tmp_path, LOW, learning.TRAINING_GROUPS[LOW][1])[2] / "run.json").write_text(
-        '{"status": "interrupted"}'
-    )
-    assert [*learning.finished_runs(tmp_path, LOW)] == ["ppo-paper"]  # one seed of three is not finished
-    assert learning.seconds_left(tmp_path, [HIGH, LOW]) == 240.0
-    for settings in (full, ReproductionSettings(tmp_path)):
-        missing = learning.reproduce_curves(HIGH, settings)
-        assert not missing.claims and not missing.figures
+
+
+def test_trainings__that_are_finished_count_and_else_those_that_are_stopped(tmp_path: Path) -> None:
+    settings, (ppo, sac) = ReproductionSettings(tmp_path), learning.TRAINING_GROUPS[LOW]
+    assert learning.reproduce_curves(LOW, settings) == Made()
+    first, second, _ = learning.runs_of(tmp_path, LOW, ppo)
+    plant(first, 1.0)
+    plant(second, 2.0, "interrupted")
+    stopped, shorter, begun = learning.runs_of(tmp_path, LOW, sac)
+    plant(stopped, 3.0, "interrupted", rows=8, planned=5_000)
+    plant(shorter, 4.0, "interrupted", rows=7, planned=5_000)
+    plant(begun, 9.0, "running")
+    assert learning.trained_runs(tmp_path, LOW) == {ppo: [first], sac: [stopped, shorter]}
+    assert learning.seconds_left(tmp_path, [LOW]) == 2 * 210.0 + 3 * 240.0
+    courses = learning.courses_of(settings, LOW)
+    assert courses["PPO"].length.startswith("1 of 3 seeds, 2,000 decisions, 1 CPU-s")
+    assert courses["SAC"].length.startswith("2 of 3 seeds, 3,000 of 5,000 decisions, 4 CPU-s")
+    assert courses["SAC"].last_harm.tolist() == [1.0, 2.0] and courses["SAC"].values.shape == (2, 6)
+    (begun / "run.json").write_text('{"status": "interrupted", "evaluations": []}')  # stopped at once
+    assert len(learning.trained_runs(tmp_path, LOW)[sac]) == 2
+    plant(learning.runs_of(tmp_path, DENSE, *learning.TRAINING_GROUPS[DENSE])[0], 1.0)
+    made = learning.reproduce_curves(LOW, settings)  # no claim that compares delays
+    assert verdicts_of(made.claims) == {"sparse": "not converged", "terminal": "not converged"}
+    assert [row[0] for row in made.sheets[0].rows] == ["PPO", "SAC"]
 
 
 def test_plans__are_of_the_papers_map_and_shipped_recipes() -> None:
@@ -175,7 +208,7 @@ def test_trainings__stop_and_continue(tiny: ReproductionSettings) -> None:
 
     with pytest.raises(InterruptedError):
         learning.train_groups(replace(tiny, tell=stop), [STOPPED])
-    assert learning.finished_runs(tiny.folder, STOPPED) == {} and learning.seconds_left(tiny.folder, [STOPPED]) == 6.0
+    assert learning.trained_runs(tiny.folder, STOPPED) == {} and learning.seconds_left(tiny.folder, [STOPPED]) == 6.0
     assert learning.train_groups(tiny, [STOPPED]) and learning.seconds_left(tiny.folder, [STOPPED]) == 0.0
     agent = eb.make_agent(learning.unconverged_policy(tiny.folder), scenario="paper-random")
     assert agent.policy.manifest.steps == 512
@@ -183,20 +216,21 @@ def test_trainings__stop_and_continue(tiny: ReproductionSettings) -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_process__is_trained_once_in_the_papers_map_and_shown(tiny: ReproductionSettings) -> None:
-    assert process_sheet(tiny, STATED, 20) == []
+    assert process_sheet(tiny) == []
     assert learning.train_groups(tiny, [RANDOM])
-    seeds = learning.finished_runs(tiny.folder, RANDOM)["ppo-paper"]
-    assert learning.course_of(seeds).seconds > 0.0
+    (seeds,) = learning.trained_runs(tiny.folder, RANDOM).values()
+    assert learning.course_of(seeds, 2).seconds > 0.0 and len(seeds) == 2
     before = [(run / "run.json").stat().st_mtime_ns for run in seeds]
     assert learning.train_groups(tiny, [RANDOM]) and before == [(run / "run.json").stat().st_mtime_ns for run in seeds]
     mapped = eb.load_scenario("paper-random").replace(physics="paper-map")
     for run in seeds:
         assert '"physics": "paper-map"' in (run / "config.json").read_text("utf-8")
     specs = [f"policy@{run / 'policy'}" for run in seeds]
-    assert learning.process(tiny) == {"PPO": specs} and learning.process(replace(tiny, full=False)) == {}
+    assert learning.process(tiny) == learning.process(replace(tiny, full=False)) == {"PPO": specs}
     result = eb.evaluate(mapped, specs, episodes=20)
     harm = [result[spec]["first_impact_harm"].mean() for spec in specs]
     assert harm[0] != harm[1]  # other seeds
-    (row,) = (row for row in process_sheet(tiny, STATED, 20)[0].rows if row[0] == "PPO")
+    (row,) = (row for row in process_sheet(tiny)[0].rows if row[0] == "PPO")
     assert row[2].value == pytest.approx(np.mean(harm))
     assert [*all_records(replace(tiny, policies={"PPO": "coast"}))["paper's process"]] == [("PPO", 1), ("PPO", 2)]
+    assert "paper's process" not in all_records(tiny)  # there is no SAC beside PPO

@@ -2,6 +2,7 @@
 
 import csv
 import re
+from collections import Counter
 from typing import get_args
 
 import pytest
@@ -20,6 +21,7 @@ from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.site import DOCS, load
 
 PAGE = (DOCS / "paper.md").read_text("utf-8")
+README = (DOCS.parent / "README.md").read_text("utf-8")
 RESULTS = DOCS / "results" / "reproduction" / "claims.csv"
 
 sampling = load("../studies/sampling")
@@ -57,6 +59,15 @@ def test_results__have_a_number_in_each_row_that_was_run_and_the_reason_for_its_
         assert re.search(r"\d", ours) or verdict == "not run"
         assert why == sentence["why"].get(verdict, "").strip()
         assert why or verdict in ("agrees", "not run")
+
+
+def test_readme__has_the_number_of_each_verdict() -> None:
+    count = Counter(row[4] for row in sentences())
+    assert (
+        f"of its {len(SENTENCES)} sentences and numbers, {count['agrees']} agree, {count['differs']} differ,"
+        f" {count['cannot be']} cannot be, {count['undecided']} are undecided, {count['not converged']} rest on a"
+        f" training that has not converged, and {count['not run']} wait for a long training"
+    ) in " ".join(README.split())
 
 
 def test_sentences__are_judged_by_claims_that_the_code_makes_and_no_claim_is_left_out(

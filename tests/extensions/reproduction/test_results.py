@@ -226,7 +226,7 @@ def ppo_is_unconverged(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def process_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    course = Course([{k: -9.0 + min(k, 3) for k in range(9)}] * 2, [{100.0: 1.0}] * 2, 9_000.0, 7.0)
+    course = Course([{k: -9.0 + min(k, 3) for k in range(9)}] * 2, [{100.0: 1.0}] * 2, 9_000.0, 7.0, 9_000.0, 5)
     monkeypatch.setattr(
         strategies, "process", lambda settings: {name: [spec, spec] for name, spec in SHIPPED_SPECS.items()}
     )
@@ -237,11 +237,11 @@ def process_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("process_is_shipped")
 def test_random_table__has_every_printed_number_and_the_papers_process() -> None:
     made = tables.reproduce_random_table(SETTINGS)
-    claims, (printed, stated, in_map, process) = by_name(made), made.sheets
-    assert len(claims) == 11 + 9 + 2 + 6 + 2 + 1 + 4 and len(printed.rows) == 4
+    claims, (stated, in_map, process) = by_name(made), made.sheets
+    assert len(claims) == 11 + 9 + 2 + 6 + 2 + 1 + 4
     assert [row[0] for row in in_map.rows] == ["0.1 s", "0.2 s", "0.25 s", "0.3 s"]
     assert in_map.rows[1][2].value == pytest.approx(in_map.rows[1][1].value)  # as many worlds as in the list
-    length = "9,000 decisions, 7 CPU-s, last third +0.00 of 3.0"
+    length = "2 of 5 seeds, 9,000 decisions, 7 CPU-s, last third +0.00 of 3.0"
     assert claims["PPO by the process"][0].endswith(f"(PPO: {length})") and f"SAC: {length}." in process.note
     rate = claims["Non-E, collision rate"]
     assert rate == ("80.0 % [71.1, 86.7]", "96.0 % [90.2, 98.4], undecided", "differs")
@@ -255,7 +255,7 @@ def test_random_table__has_every_printed_number_and_the_papers_process() -> None
     assert [each.value for each in rows["PPO"][:3]] == pytest.approx(
         [driven["ppo"][key].mean() for key in ("collided", "first_impact_harm", "total_harm")]
     )
-    assert "over 2 seeds" in process.note
+    assert "means over seeds" in process.note
 
 
 @pytest.mark.usefixtures("ppo_is_unconverged")
@@ -359,9 +359,10 @@ def test_5000_worlds__cannot_be_driven_at_the_speeds_of_the_figure_of_distances(
 
 def test_trajectories_and_accelerations__have_these_numbers() -> None:
     made = trajectories.reproduce_trajectories(SETTINGS), trajectories.reproduce_accelerations(SETTINGS)
-    ends, commands = ([[cell.in_words for cell in row] for row in each.sheets[0].formatted_rows()] for each in made)
-    assert len(ends) == len(commands) == 8
-    assert ["as stated", "1", "PPO", "0", "0.00", "0.00", "0.16", "1.84"] in ends
+    record = trajectories.record_all(STATED, tuple(SHIPPED_SPECS.items()))["PPO", 1]
+    assert record.gaps_m[-1] == pytest.approx([0.16, 1.84], abs=0.005) and record.impacts.number.sum() == 0.0
+    assert record.last.harm("first")[0] == record.last.harm("total")[0] == 0.0
+    assert len(made[0].figures) == 2 and len(made[1].sheets[0].rows) == 8
     claims = {(k, *claim) for k, item in enumerate(made) for claim in item.claims}
     assert claims == {
         (0, "alike in Scenario 1", "does not hold: root mean square 2.06 m against 0.88 m", "does not hold",
