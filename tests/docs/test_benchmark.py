@@ -12,6 +12,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.benchmark import benchmark_rows, evaluate_task
+from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.files.sheet import csv_text
 from tests.docs.site import load
 from tests.fixtures.commands import Command, rows_of, told_json
@@ -28,7 +29,9 @@ IDENTITY = {"worlds_sha256": "a", "physics_digest": "b"}
 
 
 def rows_file(path: Path, *rows: dict[str, Any]) -> Path:
-    path.write_text(csv_text([{"task": "t", **SCALE, **MEANS, **IDENTITY, **row} for row in rows]))
+    written = [{"task": "t", **SCALE, **MEANS, **IDENTITY, **row} for row in rows]
+    shares = [{table.SHARE: (30 - float(row["honest_cost"])) / 20} for row in written]
+    path.write_text(csv_text([share | row for share, row in zip(shares, written, strict=True)]))
     return path
 
 
@@ -56,11 +59,21 @@ def test_benchmark__prints_a_row_for_each_task_and_writes_it(ethbrake: Command, 
         assert text["worlds_sha256"] == result["worlds_sha256"] and row["version"] == eb.__version__
         assert row["share_of_possible_reduction_honest"] == 0.0 or row["agent"] != "full_brake"
     chosen = [row["honest_cost"] for row in printed if row["agent"] == "e_v2x_bm"]
-    again = told_json(ethbrake("evaluate", "--scenario", "benchmark-all", "--episodes", "40", "--agents", "e_v2x_bm",
-                               "--set", "rules=honest", "--json"))  # fmt: skip
+    again = told_json(ethbrake("evaluate", "--scenario", "cooperation-4-all", "--episodes", "40", "--agents",
+                               "e_v2x_bm", "--set", "rules=honest", "--json"))  # fmt: skip
     assert again[0]["honest_cost"] == chosen[0]  # by default agents minimise the honest cost
     shown = ethbrake(*words, "--agents", "coast", "--force").out
     assert "benchmark-truck" in shown and "Possible" in shown
+
+
+def test_benchmark__of_one_task_has_the_rows_of_the_group(ethbrake: Command, empty_folder: Path) -> None:
+    words = ("evaluate", "--episodes", "40", "--agents", "full_brake,e_v2x_bm", "--output")
+    for folder, scenario in (("one", "benchmark-pair"), ("all", "benchmark")):
+        ethbrake(*words, folder, "--scenario", scenario)
+    all_rows = rows_of(Path("all/rows.csv"))
+    assert rows_of(Path("one/rows.csv")) == [row for row in all_rows if row["task"] == "benchmark-pair"]
+    cells = table.read_rows([Path("one/rows.csv")])  # a trial has its table, too
+    assert float(all_rows[0][table.SHARE]) == 0.0 and table.shares_of(cells, "benchmark-pair", "full_brake").value == 0
 
 
 def test_table__shows_the_middle_three_of_five_seeds_on_the_scale(tmp_path: Path) -> None:
@@ -75,26 +88,26 @@ def test_table__shows_the_middle_three_of_five_seeds_on_the_scale(tmp_path: Path
         {"agent": "omniscient", "honest_cost": "12"} | {"sees_through_channel": "True"},
     )
     cells = table.read_rows([rules, rows_file(tmp_path / "m.csv", *seeds)])
-    head, _, first, second, last, best = table.table(cells, "t")
-    assert [row[0] for row in (first, second, last, best)] == [
-        "`omniscient` †",
-        "`m`",
-        "`full_brake`",
-        "best known (search)",
-    ]
-    assert second[1:4] == ["5", "200", "20"] and second[4].startswith("73.3 % [") and second[5].startswith("15.33 [")
-    assert first[4] == "90.0 %" and last[4] == "0.0 %" and best[4:6] == ["100.0 %", "10.00"] and len(head) == len(best)
+    first, second, last, best = table.table(cells)
+    names = ["omniscient †", "m", "full_brake", "best known (search)"]
+    assert [row["method"] for row in (first, second, last, best)] == names
+    assert [second[key] for key in ("seeds", "decisions", "CPU s")] == ["5", "200", "20"]
+    assert second["share of the possible"].startswith("73.3 % [") and second["honest cost"].startswith("15.33 [")
+    assert [row["share of the possible"] for row in (first, last, best)] == ["90.0 %", "0.0 %", "100.0 %"]
+    assert best["honest cost"] == "10.00" and best.keys() == second.keys()
+    shares = {row["method"]: row["t"] for row in table.overview(cells)}
+    assert shares["m"] == second["share of the possible"] and shares["full braking, honest cost"] == "30.00"
     figure = tmp_path / "figure.png"
-    table.write_picture(figure, table.draw(cells, ["t"]), force=True)
+    table.write_picture(figure, table.draw(cells), force=True)
     assert figure.read_bytes().startswith(PNG)
 
 
-def test_table__refuses_rows_of_other_worlds_and_a_task_without_its_scale(tmp_path: Path) -> None:
+def test_table__refuses_rows_of_other_worlds_and_rows_without_a_share(tmp_path: Path) -> None:
     mine, other = ({"agent": "m", **more} for more in ({}, {"worlds_sha256": "c"}))
     with refused("has other worlds or another physics than other files"):
         table.read_rows([rows_file(tmp_path / "a.csv", mine), rows_file(tmp_path / "b.csv", other)])
-    with refused("t: has no row of full_brake"):
-        table.table(table.read_rows([tmp_path / "a.csv"]), "t")
+    with refused("a.csv: t, m: has no share of the possible reduction; evaluate full_brake beside it"):
+        table.read_rows([rows_file(tmp_path / "a.csv", {**mine, table.SHARE: ""})])
 
 
 def test_table__refuses_what_must_not_be_one_row(tmp_path: Path) -> None:
@@ -112,9 +125,18 @@ def test_table__refuses_what_must_not_be_one_row(tmp_path: Path) -> None:
         table.read_rows([tmp_path / "c.csv"])
 
 
-def test_table__on_the_page_is_that_of_the_committed_rows() -> None:
-    page = (FOLDER.parents[1] / "docs" / "results" / "benchmark.md").read_text("utf-8")
-    assert table.text_of(table.read_rows(table.ROWS.glob("*.csv"))) in page
+def test_table__on_the_page_and_in_its_file_is_that_of_the_committed_rows() -> None:
+    results = FOLDER.parents[1] / "docs" / "results"
+    cells = table.read_rows(table.ROWS.glob("*.csv"))
+    assert table.text_of(table.overview(cells)) in (results / "benchmark.md").read_text("utf-8")
+    assert csv_text(table.table(cells)) == (results / "benchmark.csv").read_text("utf-8")
+
+
+@pytest.mark.usefixtures("pinned_matplotlib")
+def test_figure__is_drawn_from_the_committed_rows() -> None:
+    made = table.draw(table.read_rows(table.ROWS.glob("*.csv")))
+    shown = FOLDER.parents[1] / "docs" / "figures" / "benchmark.png"
+    assert picture_bytes(made, "made.png") == shown.read_bytes()
 
 
 def test_cross_play__of_two_teams_by_hand() -> None:
