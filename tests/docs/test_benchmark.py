@@ -182,6 +182,15 @@ def test_method__saves_what_its_agent_drives(file: str, method: str, tmp_path: P
     assert (result["mine"]["honest_cost"] != result["full_brake"]["honest_cost"]).any()
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_marl__trains_three_learners_to_the_last_decision(tmp_path: Path) -> None:
+    pytest.importorskip("benchmarl", reason="needs the extra marl")
+    task = eb.load_scenario("benchmark-all")
+    load(FOLDER / "marl").ippo(task, 0, 8_400, tmp_path)  # 64 / 3 is no whole number of steps
+    assert (tmp_path / "policy.pt").exists()
+
+
 def test_marl__needs_several_learners(tmp_path: Path) -> None:
     pytest.importorskip("benchmarl", reason="needs the extra marl")
     with pytest.raises(InvalidInput, match="has one learner"):
