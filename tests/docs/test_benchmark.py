@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -125,11 +126,45 @@ def test_table__refuses_what_must_not_be_one_row(tmp_path: Path) -> None:
         table.read_rows([tmp_path / "c.csv"])
 
 
-def test_table__on_the_page_and_in_its_file_is_that_of_the_committed_rows() -> None:
+def test_differences__of_two_methods_and_of_two_tasks_by_hand(tmp_path: Path) -> None:
+    costs = {("pair", "mappo"): (10, 12, 11), ("pair", "ippo"): (20, 20, 20), ("blocked", "ippo"): (23, 23, 23)}
+    rows = [
+        {"task": f"benchmark-{task}", "agent": method, "seed": seed, "honest_cost": cost}
+        for (task, method), seeds in costs.items()
+        for seed, cost in enumerate(seeds)
+    ]
+    central, blocked = table.differences(table.read_rows([rows_file(tmp_path / "m.csv", *rows)]))
+    assert (central["cell"], central["minus"]) == ("benchmark-pair, mappo", "benchmark-pair, ippo")
+    assert central["honest cost"] == "-9.00 [-10.00, -8.00]"
+    assert blocked["cell"] == "benchmark-blocked, ippo" and blocked["honest cost"] == "3.00 [3.00, 3.00]"
+
+
+def test_cross_play__has_the_means_on_and_off_the_diagonal(tmp_path: Path) -> None:
+    file = tmp_path / "benchmark-pair.mine.csv"
+    cost = [[1, 5, 6], [5, 1, 4], [6, 4, 1]]
+    pairings = [{"task": "benchmark-pair", "honest_cost": value} for row in cost for value in row]
+    file.write_text(csv_text(pairings))
+    [row] = table.cross_play([file])
+    assert (row["task"], row["method"], row["on the diagonal"]) == ("benchmark-pair", "mine", "1.00 [1.00, 1.00]")
+    assert row["off the diagonal"] == "5.00 [4.00, 6.00]"  # a sample has two teams or three
+
+
+def test_tables__on_the_page_and_in_a_file_are_those_of_the_committed_rows() -> None:
     results = FOLDER.parents[1] / "docs" / "results"
-    cells = table.read_rows(table.ROWS.glob("*.csv"))
-    assert table.text_of(table.overview(cells)) in (results / "benchmark.md").read_text("utf-8")
+    page, cells = (results / "benchmark.md").read_text("utf-8"), table.read_rows(table.ROWS.glob("*.csv"))
+    assert table.text_of(table.overview(cells)) in page
+    assert table.text_of(table.cross_play(table.CROSS_PLAY.glob("*.csv"))) in page
     assert csv_text(table.table(cells)) == (results / "benchmark.csv").read_text("utf-8")
+    tables = [table.overview(cells), table.table(cells), table.differences(cells)]
+    values = {value for rows in tables for row in rows for value in row.values()}
+    for path, begin, end in (
+        (results / "benchmark.md", "## Results\n", "\n| "),
+        (results.parent / "findings.md", "## Which method learns best", "\n## "),
+        (results.parents[1] / "README.md", "- **Methods.**", "\n\n"),
+    ):
+        text = " ".join(path.read_text("utf-8").partition(begin)[2].partition(end)[0].split())
+        said = re.findall(r"-?\d+\.\d+(?: %)? \[[^]]*\]", text)
+        assert len(said) >= 3 and {*said} <= values
 
 
 @pytest.mark.usefixtures("pinned_matplotlib")

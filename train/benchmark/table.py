@@ -6,7 +6,8 @@
 
 Rows come from `train/benchmark/run.py` (one for each task, method and seed) and from `ethbrake evaluate --scenario
 benchmark --output` (one for each task and agent). The first table has the share of the possible reduction (0 for full
-braking, 1 for the best known cost); the second table, also written by `--csv`, has all measures.
+braking, 1 for the best known cost); the second table, also written by `--csv`, has all measures. For the committed
+rows, two more tables follow: differences in honest cost, and cross-play.
 """
 
 from __future__ import annotations
@@ -19,14 +20,16 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import bootstrap, trim_mean
+from scipy.stats import trim_mean
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, write_picture
 from ethbrake_marl.files.sheet import Column, Estimate, csv_text
 from ethbrake_marl.files.store import write_file
+from ethbrake_marl.motion.layout import Floats
 
 ROWS = Path(__file__).resolve().parents[2] / "docs" / "results" / "benchmark"
+CROSS_PLAY = ROWS / "cross_play"  # matrices of cross_play.py
 Row = Mapping[str, str]
 Cells = dict[tuple[str, str], list[Row]]  # (task, method) -> rows of its seeds
 SHARE = "share_of_possible_reduction_honest"
@@ -77,10 +80,17 @@ def interquartile_mean(values: Iterable[float]) -> Estimate:
     middle = float(trim_mean(numbers, 0.25))
     if len(numbers) < 2:
         return Estimate(middle, None)
-    again = bootstrap(
-        [numbers], lambda drawn, axis: trim_mean(drawn, 0.25, axis=axis), n_resamples=10_000, method="percentile", rng=0
-    )
-    return Estimate(middle, (float(again.confidence_interval.low), float(again.confidence_interval.high)))
+    return Estimate(middle, percentiles(trim_mean(redrawn(numbers, 0), 0.25, axis=1)))
+
+
+def redrawn(numbers: Floats, seed: int) -> Floats:
+    """Bootstrap samples, [10,000, seeds]."""
+    return np.random.default_rng(seed).choice(numbers, (10_000, len(numbers)))
+
+
+def percentiles(values: Floats) -> tuple[float, float]:
+    low, high = np.nanpercentile(values, (2.5, 97.5)).tolist()
+    return low, high
 
 
 def shares_of(cells: Cells, task: str, method: str) -> Estimate:
@@ -124,16 +134,54 @@ def best_known(cells: Cells, task: str) -> str:
 
 
 def overview(cells: Cells) -> list[dict[str, str]]:
-    """The share of each method (row) in each task (column), and the scale."""
+    """The share of each method (row) in each task (column), the best mean first, and the scale."""
     tasks = tasks_of(cells)
+    shares: dict[str, dict[str, Estimate]] = defaultdict(dict)
+    for task, method in cells:
+        shares[method][task] = shares_of(cells, task, method)
     rows = []
-    for method in dict.fromkeys(method for task in tasks for method in methods_of(cells, task)):
-        shares = {task: shares_of(cells, task, method) if (task, method) in cells else None for task in tasks}
-        rows.append({"method": method} | {task: PERCENT.show(share).in_words for task, share in shares.items()})
+    for method in sorted(shares, key=lambda method: -np.mean([share.value for share in shares[method].values()])):
+        rows.append({"method": method} | {task: PERCENT.show(shares[method].get(task)).in_words for task in tasks})
     full = {task: cells[task, "full_brake"][0]["honest_cost"] for task in tasks if (task, "full_brake") in cells}
     costs = {task: f"{float(full[task]):.2f}" if task in full else "–" for task in tasks}
     rows.append({"method": "full braking, honest cost"} | costs)
     rows.append({"method": "best known, honest cost"} | {task: best_known(cells, task) for task in tasks})
+    return rows
+
+
+def differences(cells: Cells) -> list[dict[str, str]]:
+    """Difference in honest cost between two cells, with its bootstrap interval over the seeds of both."""
+    pairs = [((task, "mappo"), (task, "ippo")) for task in tasks_of(cells)]
+    pairs += [
+        (("benchmark-blocked", method), ("benchmark-pair", method)) for method in methods_of(cells, "benchmark-pair")
+    ]
+    rows = []
+    for one, other in pairs:
+        if one in cells and other in cells:
+            first, second = (np.array([float(row["honest_cost"]) for row in cells[at]]) for at in (one, other))
+            drawn = [trim_mean(redrawn(costs, seed), 0.25, axis=1) for seed, costs in enumerate((first, second))]
+            value = float(trim_mean(first, 0.25) - trim_mean(second, 0.25))
+            difference = Estimate(value, percentiles(drawn[0] - drawn[1]) if len(first) > 1 else None)
+            rows.append({"cell": ", ".join(one), "minus": ", ".join(other), "honest cost": difference.in_words()})
+    return rows
+
+
+def cross_play(files: Iterable[Path]) -> list[dict[str, str]]:
+    """Mean honest cost on and off the diagonal of each matrix, with bootstrap intervals over the teams."""
+    rows = []
+    for file in sorted(files):
+        pairings = [*csv.DictReader(file.read_text().splitlines())]
+        cost = np.array([float(row["honest_cost"]) for row in pairings])
+        teams = round(len(cost) ** 0.5)
+        cost = cost.reshape(teams, teams)
+        drawn = redrawn(np.arange(teams), 0)
+        drawn = drawn[(drawn != drawn[:, :1]).any(axis=1)]  # samples with two teams or more
+        apart = drawn[:, :, None] != drawn[:, None, :]
+        off = np.where(apart, cost[drawn[:, :, None], drawn[:, None, :]], np.nan)
+        means = {"on": cost.diagonal()[drawn].mean(axis=1), "off": np.nanmean(off, axis=(1, 2))}
+        values = {"on": cost.diagonal().mean(), "off": cost[~np.eye(teams, dtype=bool)].mean()}
+        ends = {f"{at} the diagonal": Estimate(values[at], percentiles(means[at])).in_words() for at in means}
+        rows.append({"task": pairings[0]["task"], "method": file.stem.partition(".")[2]} | ends)
     return rows
 
 
@@ -179,7 +227,10 @@ if __name__ == "__main__":
     args = parser.parse_args()
     try:
         cells = read_rows(args.rows or ROWS.glob("*.csv"))
-        print(f"{text_of(overview(cells))}\n\n{text_of(table(cells))}")
+        tables = [overview(cells), table(cells)]
+        if not args.rows:
+            tables += [differences(cells), cross_play(CROSS_PLAY.glob("*.csv"))]
+        print("\n\n".join(text_of(rows) for rows in tables))
         if args.csv:
             write_file(args.csv, csv_text(table(cells)).encode())
         if args.figure:
