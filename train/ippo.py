@@ -4,8 +4,7 @@
     ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@runs/ippo --set rules=honest
 
 Each learner has its own actor, critic and optimiser, and the other learners are part of its environment. All learners
-learn at the same time, from the same episodes. In `train/mappo.py` one critic observes the whole line instead. Letters:
-T time steps, C copies, F features.
+learn at the same time, from the same episodes. Letters: T time steps, C copies, F features.
 """
 
 from __future__ import annotations

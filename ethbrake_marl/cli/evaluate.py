@@ -63,7 +63,8 @@ def evaluate_command(
     is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
     total harm instead of first-impact harm; with --set rules=honest, total harm and a price for pushes, for driving and
     for motion at the horizon. --set measures=pushed_mps,pushed_m adds measures to the
-    results. --scenario benchmark evaluates the tasks of the benchmark, for which agents minimise the honest cost.
+    results. --scenario benchmark evaluates the tasks of the benchmark, and the name of a task only this task; there,
+    agents minimise the honest cost.
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.cli.settings import read_settings
@@ -83,12 +84,13 @@ def evaluate_command(
             raise InvalidInput(
                 f"--report: records episodes, which needs exact impacts, and physics: {physics} has none; leave it out"
             )
-        if scenario == BENCHMARK:
+        is_benchmark = scenario in (BENCHMARK, *group_of_scenarios(BENCHMARK))
+        if is_benchmark:
             measures = ",".join(filter(None, [chosen.command.get("measures"), *benchmark_measures()]))
             chosen = chosen._replace(command={"harm_count": COUNT, **chosen.command, "measures": measures})
         comparisons = {}
         for name in names or [scenario]:
-            usual = GROUP_EPISODES if names and name not in THREE_TESTS else 10_000
+            usual = GROUP_EPISODES if is_benchmark or (names and name not in THREE_TESTS) else 10_000
             count = usual if episodes is None else episodes
             comparisons[name] = _compare(out, name, chosen, agents, count, seed, jobs)
         if report and output is not None:
@@ -96,7 +98,7 @@ def evaluate_command(
             output.mkdir(parents=True, exist_ok=True)
             write(output / REPORT, comparisons[scenario], "ethbrake " + " ".join(sys.argv[1:]), force=force)
             out.note(f"report: {output / REPORT}")
-        _show(out, scenario, comparisons, output, per_world, REPORT if report else "")
+        _show(out, comparisons, output, per_world, REPORT if report else "", is_benchmark=is_benchmark)
 
 
 def _compare(
@@ -114,10 +116,10 @@ def _compare(
 
 
 def _show(
-    out: Out, scenario: str, comparisons: dict[str, Compared], output: Path | None, per_world: Any, page: str
+    out: Out, comparisons: dict[str, Compared], output: Path | None, per_world: Any, page: str, *, is_benchmark: bool
 ) -> None:
     """Write the results to the folder ``output``, if there is one, and print them."""
-    from ethbrake_marl.evaluation.benchmark import BENCHMARK, benchmark_rows, benchmark_sheet
+    from ethbrake_marl.evaluation.benchmark import benchmark_rows, benchmark_sheet
     from ethbrake_marl.evaluation.results import write_results
     from ethbrake_marl.evaluation.summary import summarise_lists
     from ethbrake_marl.files.sheet import csv_text
@@ -133,7 +135,7 @@ def _show(
                 (place / file).unlink(missing_ok=True)
             for path in write_results(place, table, results[name], per_world, force=out.force):
                 out.note(f"results: {path}")
-    if scenario == BENCHMARK:
+    if is_benchmark:
         rows, sheet = benchmark_rows(tables), benchmark_sheet(tables)
         if output is not None:
             write_output(output / ROWS, csv_text(rows).encode(), force=out.force)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.benchmark import benchmark_rows, evaluate_task
+from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.files.sheet import csv_text
 from tests.docs.site import load
 from tests.fixtures.commands import Command, rows_of, told_json
@@ -28,7 +30,9 @@ IDENTITY = {"worlds_sha256": "a", "physics_digest": "b"}
 
 
 def rows_file(path: Path, *rows: dict[str, Any]) -> Path:
-    path.write_text(csv_text([{"task": "t", **SCALE, **MEANS, **IDENTITY, **row} for row in rows]))
+    written = [{"task": "t", **SCALE, **MEANS, **IDENTITY, **row} for row in rows]
+    shares = [{table.SHARE: (30 - float(row["honest_cost"])) / 20} for row in written]
+    path.write_text(csv_text([share | row for share, row in zip(shares, written, strict=True)]))
     return path
 
 
@@ -56,11 +60,21 @@ def test_benchmark__prints_a_row_for_each_task_and_writes_it(ethbrake: Command, 
         assert text["worlds_sha256"] == result["worlds_sha256"] and row["version"] == eb.__version__
         assert row["share_of_possible_reduction_honest"] == 0.0 or row["agent"] != "full_brake"
     chosen = [row["honest_cost"] for row in printed if row["agent"] == "e_v2x_bm"]
-    again = told_json(ethbrake("evaluate", "--scenario", "benchmark-all", "--episodes", "40", "--agents", "e_v2x_bm",
-                               "--set", "rules=honest", "--json"))  # fmt: skip
+    again = told_json(ethbrake("evaluate", "--scenario", "cooperation-4-all", "--episodes", "40", "--agents",
+                               "e_v2x_bm", "--set", "rules=honest", "--json"))  # fmt: skip
     assert again[0]["honest_cost"] == chosen[0]  # by default agents minimise the honest cost
     shown = ethbrake(*words, "--agents", "coast", "--force").out
     assert "benchmark-truck" in shown and "Possible" in shown
+
+
+def test_benchmark__of_one_task_has_the_rows_of_the_group(ethbrake: Command, empty_folder: Path) -> None:
+    words = ("evaluate", "--episodes", "40", "--agents", "full_brake,e_v2x_bm", "--output")
+    for folder, scenario in (("one", "benchmark-pair"), ("all", "benchmark")):
+        ethbrake(*words, folder, "--scenario", scenario)
+    all_rows = rows_of(Path("all/rows.csv"))
+    assert rows_of(Path("one/rows.csv")) == [row for row in all_rows if row["task"] == "benchmark-pair"]
+    cells = table.read_rows([Path("one/rows.csv")])  # a trial has its table, too
+    assert float(all_rows[0][table.SHARE]) == 0.0 and table.shares_of(cells, "benchmark-pair", "full_brake").value == 0
 
 
 def test_table__shows_the_middle_three_of_five_seeds_on_the_scale(tmp_path: Path) -> None:
@@ -75,26 +89,26 @@ def test_table__shows_the_middle_three_of_five_seeds_on_the_scale(tmp_path: Path
         {"agent": "omniscient", "honest_cost": "12"} | {"sees_through_channel": "True"},
     )
     cells = table.read_rows([rules, rows_file(tmp_path / "m.csv", *seeds)])
-    head, _, first, second, last, best = table.table(cells, "t")
-    assert [row[0] for row in (first, second, last, best)] == [
-        "`omniscient` †",
-        "`m`",
-        "`full_brake`",
-        "best known (search)",
-    ]
-    assert second[1:4] == ["5", "200", "20"] and second[4].startswith("73.3 % [") and second[5].startswith("15.33 [")
-    assert first[4] == "90.0 %" and last[4] == "0.0 %" and best[4:6] == ["100.0 %", "10.00"] and len(head) == len(best)
+    first, second, last, best = table.table(cells)
+    names = ["omniscient †", "m", "full_brake", "best known (search)"]
+    assert [row["method"] for row in (first, second, last, best)] == names
+    assert [second[key] for key in ("seeds", "decisions", "CPU s")] == ["5", "200", "20"]
+    assert second["share of the possible"].startswith("73.3 % [") and second["honest cost"].startswith("15.33 [")
+    assert [row["share of the possible"] for row in (first, last, best)] == ["90.0 %", "0.0 %", "100.0 %"]
+    assert best["honest cost"] == "10.00" and best.keys() == second.keys()
+    shares = {row["method"]: row["t"] for row in table.overview(cells)}
+    assert shares["m"] == second["share of the possible"] and shares["full braking, honest cost"] == "30.00"
     figure = tmp_path / "figure.png"
-    table.write_picture(figure, table.draw(cells, ["t"]), force=True)
+    table.write_picture(figure, table.draw(cells), force=True)
     assert figure.read_bytes().startswith(PNG)
 
 
-def test_table__refuses_rows_of_other_worlds_and_a_task_without_its_scale(tmp_path: Path) -> None:
+def test_table__refuses_rows_of_other_worlds_and_rows_without_a_share(tmp_path: Path) -> None:
     mine, other = ({"agent": "m", **more} for more in ({}, {"worlds_sha256": "c"}))
     with refused("has other worlds or another physics than other files"):
         table.read_rows([rows_file(tmp_path / "a.csv", mine), rows_file(tmp_path / "b.csv", other)])
-    with refused("t: has no row of full_brake"):
-        table.table(table.read_rows([tmp_path / "a.csv"]), "t")
+    with refused("a.csv: t, m: has no share of the possible reduction; evaluate full_brake beside it"):
+        table.read_rows([rows_file(tmp_path / "a.csv", {**mine, table.SHARE: ""})])
 
 
 def test_table__refuses_what_must_not_be_one_row(tmp_path: Path) -> None:
@@ -112,9 +126,52 @@ def test_table__refuses_what_must_not_be_one_row(tmp_path: Path) -> None:
         table.read_rows([tmp_path / "c.csv"])
 
 
-def test_table__on_the_page_is_that_of_the_committed_rows() -> None:
-    page = (FOLDER.parents[1] / "docs" / "results" / "benchmark.md").read_text("utf-8")
-    assert table.text_of(table.read_rows(table.ROWS.glob("*.csv"))) in page
+def test_differences__of_two_methods_and_of_two_tasks_by_hand(tmp_path: Path) -> None:
+    costs = {("pair", "mappo"): (10, 12, 11), ("pair", "ippo"): (20, 20, 20), ("blocked", "ippo"): (23, 23, 23)}
+    rows = [
+        {"task": f"benchmark-{task}", "agent": method, "seed": seed, "honest_cost": cost}
+        for (task, method), seeds in costs.items()
+        for seed, cost in enumerate(seeds)
+    ]
+    central, blocked = table.differences(table.read_rows([rows_file(tmp_path / "m.csv", *rows)]))
+    assert (central["cell"], central["minus"]) == ("benchmark-pair, mappo", "benchmark-pair, ippo")
+    assert central["honest cost"] == "-9.00 [-10.00, -8.00]"
+    assert blocked["cell"] == "benchmark-blocked, ippo" and blocked["honest cost"] == "3.00 [3.00, 3.00]"
+
+
+def test_cross_play__has_the_means_on_and_off_the_diagonal(tmp_path: Path) -> None:
+    file = tmp_path / "benchmark-pair.mine.csv"
+    cost = [[1, 5, 6], [5, 1, 4], [6, 4, 1]]
+    pairings = [{"task": "benchmark-pair", "honest_cost": value} for row in cost for value in row]
+    file.write_text(csv_text(pairings))
+    [row] = table.cross_play([file])
+    assert (row["task"], row["method"], row["on the diagonal"]) == ("benchmark-pair", "mine", "1.00 [1.00, 1.00]")
+    assert row["off the diagonal"] == "5.00 [4.00, 6.00]"  # a sample has two teams or three
+
+
+def test_tables__on_the_page_and_in_a_file_are_those_of_the_committed_rows() -> None:
+    results = FOLDER.parents[1] / "docs" / "results"
+    page, cells = (results / "benchmark.md").read_text("utf-8"), table.read_rows(table.ROWS.glob("*.csv"))
+    assert table.text_of(table.overview(cells)) in page
+    assert table.text_of(table.cross_play(table.CROSS_PLAY.glob("*.csv"))) in page
+    assert csv_text(table.table(cells)) == (results / "benchmark.csv").read_text("utf-8")
+    tables = [table.overview(cells), table.table(cells), table.differences(cells)]
+    values = {value for rows in tables for row in rows for value in row.values()}
+    for path, begin, end in (
+        (results / "benchmark.md", "## Results\n", "\n| "),
+        (results.parent / "findings.md", "## Which method learns best", "\n## "),
+        (results.parents[1] / "README.md", "- **Methods.**", "\n\n"),
+    ):
+        text = " ".join(path.read_text("utf-8").partition(begin)[2].partition(end)[0].split())
+        said = re.findall(r"-?\d+\.\d+(?: %)? \[[^]]*\]", text)
+        assert len(said) >= 3 and {*said} <= values
+
+
+@pytest.mark.usefixtures("pinned_matplotlib")
+def test_figure__is_drawn_from_the_committed_rows() -> None:
+    made = table.draw(table.read_rows(table.ROWS.glob("*.csv")))
+    shown = FOLDER.parents[1] / "docs" / "figures" / "benchmark.png"
+    assert picture_bytes(made, "made.png") == shown.read_bytes()
 
 
 def test_cross_play__of_two_teams_by_hand() -> None:
@@ -158,6 +215,15 @@ def test_method__saves_what_its_agent_drives(file: str, method: str, tmp_path: P
     rows = benchmark_rows({"benchmark-pair": eb.summarise(result)}, method=method)
     assert rows[1]["method"] == method and rows[1]["share_of_possible_reduction_honest"] < 1.0
     assert (result["mine"]["honest_cost"] != result["full_brake"]["honest_cost"]).any()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_marl__trains_three_learners_to_the_last_decision(tmp_path: Path) -> None:
+    pytest.importorskip("benchmarl", reason="needs the extra marl")
+    task = eb.load_scenario("benchmark-all")
+    load(FOLDER / "marl").ippo(task, 0, 8_400, tmp_path)  # 64 / 3 is no whole number of steps
+    assert (tmp_path / "policy.pt").exists()
 
 
 def test_marl__needs_several_learners(tmp_path: Path) -> None:

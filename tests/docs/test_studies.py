@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from concurrent.futures import Future
 
 import numpy as np
 import pytest
@@ -12,12 +11,7 @@ from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.training.training import Training
-from tests.docs.printed import rows as table_of
 from tests.docs.site import DOCS, load
-
-team_curves = load("../studies/team_curves")
-PNG = b"\x89PNG"
-
 
 drawings = load("../drawings")
 
@@ -53,70 +47,6 @@ def test_restamp__renews_a_table_only_if_all_its_harms_keep_their_bits(tmp_path,
     assert same == f"cooperation-2-five: same bits, physics {physics_digest()}"
     assert other_harm.endswith("NOT renewed: other harms in worlds: 1 of 400 (total); search the list again")
     assert other_worlds.endswith("NOT renewed: its worlds are not those of its list")
-
-
-def test_team_curves__show_the_middle_three_of_five_seeds_and_what_they_compare_with() -> None:
-    level, lasts = team_curves.LEVELS[0], (9.0, 1.0, 2.0, 6.0, 4.0)  # without the best and the worst: mean 4
-    curves = [
-        {
-            "algorithm": "ippo",
-            "level": level,
-            "seed": seed,
-            "points": [[0, 0.0, 30.0, 40.0], [8192, 2.0, last, 2 * last]],
-        }
-        for seed, last in enumerate(lasts)
-    ]
-    harms = {"full_brake": [24.0, 25.0], "e_v2x_bm": [15.0, 16.0], "joint optimum": [0.5, 0.75]}
-    found = {"seconds": 2.0, "worlds": 100, "seed": 1, "speeds": [], "references": {level: harms}, "curves": curves}
-    assert json.loads(team_curves.text_of(found)) == found
-    rows = team_curves.table(found)
-    assert [row[1] for row in rows] == [
-        "full braking",
-        "E-V2X-BM (coupled)",
-        "IPPO (`train/ippo.py`)",
-        "joint optimum (search)",
-    ]
-    assert rows[2][2:4] == ["8,192", "2 s"]
-    assert [cell.split(" [")[0] for cell in rows[2][4:]] == ["4.00", "8.00"]
-    assert rows[3][4:] == ["0.50", "0.75"]
-    assert picture_bytes(team_curves.draw(found), "curves.png").startswith(PNG)
-
-
-def test_team_curves__the_table_in_the_docs_is_made_from_the_numbers_beside_the_script() -> None:
-    found = json.loads(team_curves.NUMBERS.read_bytes())
-    rows = team_curves.table(found)
-    levels, drivers = (list(dict.fromkeys(row[k] for row in rows)) for k in (0, 1))
-    harms = {(level, driver): first for level, driver, _, _, first, _ in rows}
-    assert (
-        table_of("results/learning", "## Five algorithms at 45 processor seconds each")
-        == [
-            ["who drives the learners", *levels],  # without baselines, which have other numbers on the evaluation list
-            *([driver, *(harms[level, driver] for level in levels)] for driver in drivers[2:]),
-        ]
-    )
-    assert team_curves.NUMBERS.read_text("utf-8") == team_curves.text_of(found)
-    assert len(found["curves"]) == len(team_curves.LEVELS) * len(team_curves.ALGORITHMS) * 5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("algorithm", [each for each in team_curves.ALGORITHMS if each != "benchmarl"])
-def test_team_curves__measure_before_the_first_and_after_the_last_update(algorithm) -> None:
-    first, last = team_curves.learn(algorithm, "cooperation-3-pair", 1, 0, worlds=2)
-    assert first[:2] == [0, 0.0]
-    assert last[0] > 0
-    assert last[1] > 0.0
-    assert first[2:] != last[2:]
-
-
-def test_team_curves__a_failed_job_is_counted_and_the_others_go_on(capsys) -> None:
-    good, bad = Future(), Future()
-    good.set_result("good.json")
-    bad.set_exception(ValueError("no such level"))
-    assert team_curves.finish_jobs({good: "good.json", bad: "bad.json"}) == 1
-    printed = capsys.readouterr()
-    assert "good.json\n" in printed.out
-    assert "bad.json FAILED" in printed.out
-    assert "no such level" in printed.err
 
 
 def volume_below(reference: np.ndarray, points: np.ndarray) -> float:

@@ -82,11 +82,11 @@ HERE = [each for each in WAYS if each.values[0].library in ("Stable-Baselines3",
 
 
 def test_page_of_results__has_rows_of_programs_and_counts_the_others():
-    _, *table = rows("results/learning", "## Other libraries")
+    _, *table = rows("libraries", "## What the programs reach")
     shown = [(row[0], row[2], row[3]) for row in table]
     ways = [(way.library, libraries.lowered(way.title), way.ran) for way in libraries.ways()]
     assert shown == [way for way in ways if way in shown]
-    page = (ROOT / "docs" / "results" / "learning.md").read_text("utf-8")
+    page = (ROOT / "docs" / "libraries.md").read_text("utf-8")
     assert f"runs {len(ways) - len(shown)} more programs" in " ".join(page.split())
 
 

@@ -1,4 +1,4 @@
-"""The programs in train/: IPPO and MAPPO in one file each, a GRU, SuperSuit with PPO."""
+"""The programs in train/: IPPO in one file, SuperSuit with PPO."""
 
 import sys
 from pathlib import Path
@@ -36,15 +36,14 @@ def test_supersuit__worlds_are_seeded_and_no_two_copies_are_alike(supersuit: Mod
     assert np.array_equal(seen[0][:2], native)  # copy 0 lives in the training worlds of its seed
 
 
-SINGLE_FILES = pytest.mark.parametrize("script", ["ippo", "mappo"])
 FEW = {"steps": 200, "copies": 2, "rollout": 60, "minibatch": 64, "epochs": 1, "hidden": 8}
 
 
-@pytest.mark.parametrize(("script", "name"), [("ippo", "cooperation-2-paper"), ("mappo", "cooperation-4-all")])
-def test_single_file__leaves_a_team_that_evaluates_and_is_the_same_twice(
-    name: str, script: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("name", ["cooperation-2-paper", "cooperation-4-all"])
+def test_ippo__leaves_a_team_that_evaluates_and_is_the_same_twice(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    module, line = load(f"../../train/{script}"), eb.load_scenario(name)
+    module, line = load("../../train/ippo"), eb.load_scenario(name)
     for folder, seed in (("one", 1), ("again", 1), ("other", 2)):
         module.train(module.Settings(scenario=name, seed=seed, **FEW), tmp_path / folder)
     assert "decisions: mean honest cost of an episode" in capsys.readouterr().out
@@ -58,28 +57,20 @@ def test_single_file__leaves_a_team_that_evaluates_and_is_the_same_twice(
     assert (result["mine"]["first_impact_harm"] != result["braking"]["first_impact_harm"]).any()
 
 
-@SINGLE_FILES
-def test_single_file__advantages_by_hand(script: str) -> None:
+def test_ippo__advantages_by_hand() -> None:
     """Two steps, the first of which ends an episode: A_1 = 2 - 1 + 0.5 (4 + 0) = 3; A_0 = 1 - 3 = -2."""
-    module = load(f"../../train/{script}")
+    module = load("../../train/ippo")
     settings = module.Settings(rollout=2, copies=1, gamma=0.5, gae_lambda=0.5)
-    rewards, ended = torch.tensor([[1.0], [2.0]]), torch.tensor([[1.0], [0.0]])
-    values = torch.tensor([[3.0], [1.0], [4.0]])
-    if script == "ippo":
-        rollout = module.Rollout(1, settings)
-        rollout.rewards, rollout.ended = rewards, ended
-    else:
-        rewards, ended, values = rewards[..., None], ended[..., None], values[..., None]
-        rollout = module.Rollout({}, torch.empty(0), torch.empty(0), rewards, ended)
+    rollout, values = module.Rollout(1, settings), torch.tensor([[3.0], [1.0], [4.0]])
+    rollout.rewards, rollout.ended = torch.tensor([[1.0], [2.0]]), torch.tensor([[1.0], [0.0]])
     assert module.advantages(rollout, values, settings).flatten().tolist() == [-2.0, 3.0]
-    ended[0] = 0.0  # now the second step counts for the first: -2 + 0.5 (1 + 0.5 * 3) = -0.75
+    rollout.ended[0] = 0.0  # now the second step counts for the first: -2 + 0.5 (1 + 0.5 * 3) = -0.75
     assert module.advantages(rollout, values, settings).flatten().tolist() == [-0.75, 3.0]
 
 
 @pytest.mark.slow
-@SINGLE_FILES
-def test_single_file__learns_to_beat_full_braking(script: str, tmp_path: Path) -> None:
-    module = load(f"../../train/{script}")
+def test_ippo__learns_to_beat_full_braking(tmp_path: Path) -> None:
+    module = load("../../train/ippo")
     module.train(module.Settings(steps=50_000, harm_count="first"), tmp_path)
     result = eb.evaluate(PAIR, {"braking": "full_brake", "mine": f"team@{tmp_path}"}, episodes=1000)
     braking, mine = (result[name]["first_impact_harm"].mean() for name in ("braking", "mine"))

@@ -1,15 +1,17 @@
 """Cross-play: the front learner of one team drives with the other learners of another team.
 
-    python train/benchmark/cross_play.py benchmark-pair team@runs/benchmark/runs/benchmark-pair-vine-seed{0,1,2,3,4}
+    python train/benchmark/cross_play.py benchmark-pair team@runs/benchmark/runs/benchmark-pair-cooperation-seed{0,1,2}
 
 Prints the honest cost as a matrix (row: team of the front learner; column: team of the others), the mean on the
 diagonal, where teams drive as they were trained, and the mean off the diagonal, with intervals over the worlds.
+`--csv` writes the matrix to a file, one row for each pairing.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.benchmark import COUNT, evaluate_task
 from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.files.sheet import csv_text
+from ethbrake_marl.files.store import write_file
 from ethbrake_marl.names import make_teams
 
 
@@ -44,9 +48,18 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", help="name of a scenario with several learners")
     parser.add_argument("agents", nargs="+", help="names of agents or teams")
+    parser.add_argument("--csv", type=Path, help="also write the matrix to this file")
     args = parser.parse_args()
     try:
         cost = cross_play(args.task, args.agents)
+        if args.csv:
+            names = [Path(agent).name for agent in args.agents]
+            pairings = [
+                {"task": args.task, "front": front, "others": others, "honest_cost": mean}
+                for front, row in zip(names, cost.mean(axis=2), strict=True)
+                for others, mean in zip(names, row, strict=True)
+            ]
+            write_file(args.csv, csv_text(pairings).encode())
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
     for row in cost.mean(axis=2):

@@ -35,7 +35,7 @@ def experiment_of(algorithm: str, task: eb.Scenario, seed: int, decisions: int, 
     config.gamma, config.lr, config.share_policy_params = 1.0, 1e-3, True
     config.max_n_frames, config.max_n_iters = -(-decisions // learners), None
     config.on_policy_n_envs_per_worker = config.off_policy_n_envs_per_worker = WORLDS
-    config.on_policy_collected_frames_per_batch = 64 * WORLDS // learners
+    config.on_policy_collected_frames_per_batch = -(-64 // learners) * WORLDS  # whole steps of all worlds
     config.on_policy_n_minibatch_iters, config.on_policy_minibatch_size = 10, 512 // learners
     config.off_policy_collected_frames_per_batch = WORLDS
     config.off_policy_n_optimizer_steps, config.off_policy_train_batch_size = 1, 256

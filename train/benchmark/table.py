@@ -1,11 +1,13 @@
-"""The benchmark's table and figure, from committed rows.
+"""The benchmark's tables and figure, from rows.
 
-    python train/benchmark/table.py                                    # the committed rows, docs/results/benchmark
-    python train/benchmark/table.py mine/*.csv --figure benchmark.png
+    python train/benchmark/table.py                     # the committed rows, docs/results/benchmark
+    python train/benchmark/table.py mine/rows/*.csv     # your own rows, also of a trial in fewer worlds
+    python train/benchmark/table.py --csv docs/results/benchmark.csv --figure docs/figures/benchmark.png
 
 Rows come from `train/benchmark/run.py` (one for each task, method and seed) and from `ethbrake evaluate --scenario
-benchmark --output` (one for each task and agent). The scale of a task is in the rows of `full_brake`: the share of the
-possible reduction is 0 for its honest cost, and 1 for the best known cost.
+benchmark --output` (one for each task and agent). The first table has the share of the possible reduction (0 for full
+braking, 1 for the best known cost); the second table, also written by `--csv`, has all measures. For the committed
+rows, two more tables follow: differences in honest cost, and cross-play.
 """
 
 from __future__ import annotations
@@ -18,40 +20,51 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import bootstrap, trim_mean
+from scipy.stats import trim_mean
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, write_picture
-from ethbrake_marl.files.sheet import Column, Estimate
+from ethbrake_marl.files.sheet import Column, Estimate, csv_text
+from ethbrake_marl.files.store import write_file
+from ethbrake_marl.motion.layout import Floats
 
 ROWS = Path(__file__).resolve().parents[2] / "docs" / "results" / "benchmark"
+CROSS_PLAY = ROWS / "cross_play"  # matrices of cross_play.py
 Row = Mapping[str, str]
 Cells = dict[tuple[str, str], list[Row]]  # (task, method) -> rows of its seeds
-HEAD = (
-    *("method", "seeds", "decisions", "CPU s", "share of the possible", "honest cost", "worst 5 %"),
-    *("worst-off vehicle", "first-impact harm", "total harm", "collisions", "push"),
-)
-MEANS = ("worst5_honest", "maximin_honest", "first_impact_harm", "total_harm", "collision_rate", "pushed_mps")
+SHARE = "share_of_possible_reduction_honest"
+MEANS = {  # column of the rows -> column of the table
+    "worst5_honest": "worst 5 %",
+    "maximin_honest": "worst-off vehicle",
+    "first_impact_harm": "first-impact harm",
+    "total_harm": "total harm",
+    "collision_rate": "collisions",
+    "pushed_mps": "push",
+}
 PERCENT = Column("", digits=1, scale=100.0, unit=" %")
 
 
 def read_rows(files: Iterable[Path]) -> Cells:
     """Rows by task and method.
 
-    Raises `InvalidInput` for a file without the columns, rows of other worlds or physics than the task's first row,
-    two rows of one seed, and rows of a method with other decisions or another version than its first row.
+    Raises `InvalidInput` for a file without the columns, a row without its share of the possible reduction, rows of
+    other worlds or physics than the task's first row, two rows of one seed, and rows of a method with other decisions
+    or another version than its first row.
     """
     cells: Cells = defaultdict(list)
     worlds: dict[str, tuple[str, str]] = {}
     for file in sorted(files):
         for row in csv.DictReader(file.read_text().splitlines()):
-            if missing := [name for name in ("task", "worlds_sha256", *MEANS) if name not in row]:
+            if missing := [name for name in ("task", "worlds_sha256", SHARE, *MEANS) if name not in row]:
                 raise InvalidInput(f"{file}: lacks the column {missing[0]}; must have rows of run.py or of evaluate")
             identity = row["worlds_sha256"], row["physics_digest"]
             if worlds.setdefault(row["task"], identity) != identity:
                 raise InvalidInput(f"{file}: {row['task']}: has other worlds or another physics than other files")
             cell = cells[row["task"], row.get("method") or row["agent"]]
             where = f"{file}: {row['task']}, {row.get('method') or row['agent']}"
+            if not row[SHARE]:
+                right = "evaluate full_brake beside it, in worlds of the benchmark's lists"
+                raise InvalidInput(f"{where}: has no share of the possible reduction; {right}")
             if any(other.get("seed") == row.get("seed") for other in cell):
                 raise InvalidInput(f"{where}: another row has the same seed; leave one of them out")
             for name in ("decisions", "version"):
@@ -67,23 +80,21 @@ def interquartile_mean(values: Iterable[float]) -> Estimate:
     middle = float(trim_mean(numbers, 0.25))
     if len(numbers) < 2:
         return Estimate(middle, None)
-    again = bootstrap(
-        [numbers], lambda drawn, axis: trim_mean(drawn, 0.25, axis=axis), n_resamples=10_000, method="percentile", rng=0
-    )
-    return Estimate(middle, (float(again.confidence_interval.low), float(again.confidence_interval.high)))
+    return Estimate(middle, percentiles(trim_mean(redrawn(numbers, 0), 0.25, axis=1)))
 
 
-def scale_of(cells: Cells, task: str) -> tuple[float, float]:
-    """Honest cost of full braking and best known honest cost of a task. Raises `InvalidInput` without `full_brake`."""
-    if (task, "full_brake") not in cells:
-        raise InvalidInput(f"{task}: has no row of full_brake, which has the scale; add the file of its evaluation")
-    row = cells[task, "full_brake"][0]
-    return float(row["honest_cost"]), float(row["best_known_honest"])
+def redrawn(numbers: Floats, seed: int) -> Floats:
+    """Bootstrap samples, [10,000, seeds]."""
+    return np.random.default_rng(seed).choice(numbers, (10_000, len(numbers)))
+
+
+def percentiles(values: Floats) -> tuple[float, float]:
+    low, high = np.nanpercentile(values, (2.5, 97.5)).tolist()
+    return low, high
 
 
 def shares_of(cells: Cells, task: str, method: str) -> Estimate:
-    full, best = scale_of(cells, task)
-    return interquartile_mean((full - float(row["honest_cost"])) / (full - best) for row in cells[task, method])
+    return interquartile_mean(float(row[SHARE]) for row in cells[task, method])
 
 
 def methods_of(cells: Cells, task: str) -> list[str]:
@@ -92,36 +103,85 @@ def methods_of(cells: Cells, task: str) -> list[str]:
     return sorted(methods, key=lambda method: -shares_of(cells, task, method).value)
 
 
-def table(cells: Cells, task: str) -> list[list[str]]:
-    """Rows of a task's table: the methods, and the best known cost."""
-    rows = [[*HEAD], ["---", *["---:"] * (len(HEAD) - 1)]]
-    for method in methods_of(cells, task):
-        seeds = cells[task, method]
-        spent = [float(row["cpu_s"]) for row in seeds if row.get("cpu_s")]
-        decisions = f"{int(seeds[0]['decisions']):,}" if seeds[0].get("decisions") else ""
-        cost = interquartile_mean(float(row["honest_cost"]) for row in seeds)
-        means = [interquartile_mean(float(row[name]) for row in seeds).value for name in MEANS]
-        *harms, collisions, push = means
-        rows.append([
-            f"`{method}`{' †' if seeds[0]['sees_through_channel'] == 'True' else ''}", f"{len(seeds)}", decisions,
-            f"{np.mean(spent):.0f}" if spent else "", PERCENT.show(shares_of(cells, task, method)).in_words,
-            cost.in_words(), *(f"{harm:.2f}" for harm in harms), PERCENT.show(collisions).value, f"{push:.2f}",
-        ])  # fmt: skip
-    best = f"{scale_of(cells, task)[1]:.2f}"
-    return [*rows, ["best known (search)", "", "", "", "100.0 %", best, *[""] * len(MEANS)]]
+def table(cells: Cells) -> list[dict[str, str]]:
+    """All measures: a row for each task and method, and for the best known cost of each task."""
+    rows = []
+    for task in tasks_of(cells):
+        for method in methods_of(cells, task):
+            seeds = cells[task, method]
+            spent = [float(row["cpu_s"]) for row in seeds if row.get("cpu_s")]
+            decisions = seeds[0].get("decisions")
+            means = {name: interquartile_mean(float(row[key]) for row in seeds).value for key, name in MEANS.items()}
+            rows.append({
+                "task": task,
+                "method": f"{method}{' †' if seeds[0]['sees_through_channel'] == 'True' else ''}",
+                "seeds": f"{len(seeds)}",
+                "decisions": f"{int(decisions):,}" if decisions else "",
+                "CPU s": f"{np.mean(spent):.0f}" if spent else "",
+                "share of the possible": PERCENT.show(shares_of(cells, task, method)).in_words,
+                "honest cost": interquartile_mean(float(row["honest_cost"]) for row in seeds).in_words(),
+                **{name: f"{mean:.2f}" for name, mean in means.items()},
+                "collisions": PERCENT.show(means["collisions"]).value,
+            })  # fmt: skip
+        best = {"share of the possible": "100.0 %", "honest cost": best_known(cells, task)}
+        rows.append(dict.fromkeys(rows[0], "") | {"task": task, "method": "best known (search)", **best})
+    return rows
 
 
-def overview(cells: Cells) -> list[list[str]]:
-    """Rows of the first table: the share of each method (row) in each task (column), and the scale."""
+def best_known(cells: Cells, task: str) -> str:
+    (row, *_), *_ = (rows for (at, _), rows in cells.items() if at == task)
+    return f"{float(row['best_known_honest']):.2f}"
+
+
+def overview(cells: Cells) -> list[dict[str, str]]:
+    """The share of each method (row) in each task (column), the best mean first, and the scale."""
     tasks = tasks_of(cells)
-    methods = list(dict.fromkeys(method for task in tasks for method in methods_of(cells, task)))
-    rows = [["method", *(f"`{task}`" for task in tasks)], ["---", *["---:"] * len(tasks)]]
-    for method in methods:
-        shares = [shares_of(cells, task, method) if (task, method) in cells else None for task in tasks]
-        rows.append([f"`{method}`", *(PERCENT.show(share).in_words for share in shares)])
-    scales = [scale_of(cells, task) for task in tasks]
-    for number, name in enumerate(("full braking, honest cost", "best known, honest cost")):
-        rows.append([name, *(f"{scale[number]:.2f}" for scale in scales)])
+    shares: dict[str, dict[str, Estimate]] = defaultdict(dict)
+    for task, method in cells:
+        shares[method][task] = shares_of(cells, task, method)
+    rows = []
+    for method in sorted(shares, key=lambda method: -np.mean([share.value for share in shares[method].values()])):
+        rows.append({"method": method} | {task: PERCENT.show(shares[method].get(task)).in_words for task in tasks})
+    full = {task: cells[task, "full_brake"][0]["honest_cost"] for task in tasks if (task, "full_brake") in cells}
+    costs = {task: f"{float(full[task]):.2f}" if task in full else "–" for task in tasks}
+    rows.append({"method": "full braking, honest cost"} | costs)
+    rows.append({"method": "best known, honest cost"} | {task: best_known(cells, task) for task in tasks})
+    return rows
+
+
+def differences(cells: Cells) -> list[dict[str, str]]:
+    """Difference in honest cost between two cells, with its bootstrap interval over the seeds of both."""
+    pairs = [((task, "mappo"), (task, "ippo")) for task in tasks_of(cells)]
+    pairs += [
+        (("benchmark-blocked", method), ("benchmark-pair", method)) for method in methods_of(cells, "benchmark-pair")
+    ]
+    rows = []
+    for one, other in pairs:
+        if one in cells and other in cells:
+            first, second = (np.array([float(row["honest_cost"]) for row in cells[at]]) for at in (one, other))
+            drawn = [trim_mean(redrawn(costs, seed), 0.25, axis=1) for seed, costs in enumerate((first, second))]
+            value = float(trim_mean(first, 0.25) - trim_mean(second, 0.25))
+            difference = Estimate(value, percentiles(drawn[0] - drawn[1]) if len(first) > 1 else None)
+            rows.append({"cell": ", ".join(one), "minus": ", ".join(other), "honest cost": difference.in_words()})
+    return rows
+
+
+def cross_play(files: Iterable[Path]) -> list[dict[str, str]]:
+    """Mean honest cost on and off the diagonal of each matrix, with bootstrap intervals over the teams."""
+    rows = []
+    for file in sorted(files):
+        pairings = [*csv.DictReader(file.read_text().splitlines())]
+        cost = np.array([float(row["honest_cost"]) for row in pairings])
+        teams = round(len(cost) ** 0.5)
+        cost = cost.reshape(teams, teams)
+        drawn = redrawn(np.arange(teams), 0)
+        drawn = drawn[(drawn != drawn[:, :1]).any(axis=1)]  # samples with two teams or more
+        apart = drawn[:, :, None] != drawn[:, None, :]
+        off = np.where(apart, cost[drawn[:, :, None], drawn[:, None, :]], np.nan)
+        means = {"on": cost.diagonal()[drawn].mean(axis=1), "off": np.nanmean(off, axis=(1, 2))}
+        values = {"on": cost.diagonal().mean(), "off": cost[~np.eye(teams, dtype=bool)].mean()}
+        ends = {f"{at} the diagonal": Estimate(values[at], percentiles(means[at])).in_words() for at in means}
+        rows.append({"task": pairings[0]["task"], "method": file.stem.partition(".")[2]} | ends)
     return rows
 
 
@@ -129,37 +189,51 @@ def tasks_of(cells: Cells) -> list[str]:
     return sorted({task for task, _ in cells})
 
 
-def text_of(cells: Cells) -> str:
-    """All tables as Markdown: the overview, and one for each task."""
-    tables = {"": overview(cells)} | {f"## {task}\n\n": table(cells, task) for task in tasks_of(cells)}
-    lines = {heading: "\n".join(f"| {' | '.join(row)} |" for row in rows) for heading, rows in tables.items()}
-    return "\n\n".join(f"{heading}{text}" for heading, text in lines.items())
+def text_of(rows: list[dict[str, str]]) -> str:
+    """Table as Markdown."""
+    lines = [[*rows[0]], ["---", *["---:"] * (len(rows[0]) - 1)], *(row.values() for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 @in_our_style
-def draw(cells: Cells, tasks: list[str]) -> Figure:
-    """Share of the possible reduction of each method, with its interval over the seeds; a panel for each task."""
-    columns = min(len(tasks), 2)
-    figure, panels = new_panels((9.4, 2.6 * -(-len(tasks) // columns)), -(-len(tasks) // columns), columns)
+def draw(cells: Cells) -> Figure:
+    """Share of the possible reduction of each method, with its interval over the seeds.
+
+    A panel for each task in which a method has several seeds.
+    """
+    tasks = [task for task in tasks_of(cells) if any(len(rows) > 1 for (at, _), rows in cells.items() if at == task)]
+    rows = -(-len(tasks) // 2)
+    figure, panels = new_panels((9.4, 2.8 * rows), rows, 2, sharex=True)
     for axes, task in zip(panels, tasks, strict=False):
         methods = methods_of(cells, task)[::-1]
         shares = [shares_of(cells, task, method) for method in methods]
         values = np.array([[share.value, *share.ends] for share in shares]).T * 100
-        axes.errorbar(values[0], methods, xerr=[values[0] - values[1], values[2] - values[0]], fmt="o", capsize=3)
+        ends = [values[0] - values[1], values[2] - values[0]]
+        axes.errorbar(values[0], methods, xerr=ends, fmt="o", markersize=3, capsize=4)
         axes.axvline(100, color=GREY, linestyle="--", linewidth=1.1)
-        axes.set(title=task, xlabel="share of the possible reduction (%)", xlim=(-10, 110))
-    return finish(figure, "Interquartile means over seeds with 95 % bootstrap intervals; rules have one value.")
+        axes.set(title=task)
+    return finish(
+        figure,
+        "Share of the possible reduction (%): 0 is full braking, 100 the best known. Interquartile means over seeds"
+        " with 95 % bootstrap intervals; rules have one value.",
+    )
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rows", nargs="*", type=Path, help="files of rows (default: the committed ones)")
+    parser.add_argument("--csv", type=Path, help="also write the table of all measures to this file")
     parser.add_argument("--figure", type=Path, help="also draw the figure to this file")
     args = parser.parse_args()
     try:
         cells = read_rows(args.rows or ROWS.glob("*.csv"))
-        print(text_of(cells))
+        tables = [overview(cells), table(cells)]
+        if not args.rows:
+            tables += [differences(cells), cross_play(CROSS_PLAY.glob("*.csv"))]
+        print("\n\n".join(text_of(rows) for rows in tables))
+        if args.csv:
+            write_file(args.csv, csv_text(table(cells)).encode())
         if args.figure:
-            write_picture(args.figure, draw(cells, tasks_of(cells)), force=True)
+            write_picture(args.figure, draw(cells), force=True)
     except (InvalidInput, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")

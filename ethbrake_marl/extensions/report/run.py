@@ -172,7 +172,7 @@ def report_page(
     scheme = f" and the scheme {training.scheme}" if learned == TEAM else ""
     summary = (
         f"The {learned} learned by the recipe {recipe.name}, with the algorithm {recipe.algorithm}{scheme}"
-        f" (docs/results/learning.md). It is the best of those measured during the training: that of step {steps:,}."
+        f" (docs/train.md). It is the best of those measured during the training: that of step {steps:,}."
     )
     if learned == TEAM:
         summary += f" The agent “{SHIELDED}” is the trained team with the step shield."

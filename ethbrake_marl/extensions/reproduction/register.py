@@ -80,7 +80,7 @@ GAPS = (
     Gap("seeds of the training", "multiple training tests with different random seeds", "0 to 4",
         otherwise="--full trains five, and three for each learning curve"),
     Gap("ends of the cosine, number of decisions", "table:params: cosine, no numbers", "3e-4 to 3e-5; in the recipes",
-        otherwise="not measured: one training each takes minutes; docs/results/learning.md compares recipes"),
+        otherwise="not measured: one training each takes minutes; docs/train.md has recipes"),
 )  # fmt: skip
 DEFAULTS = Gap("our defaults", "", "")
 COMBINED = Gap("several at once", "", "", (
