@@ -144,8 +144,11 @@ def test_morl_front__its_numbers_agree_with_each_other_and_with_full_braking() -
             assert measured["hypervolume_below_roof"] == pytest.approx(volume_below(np.full(3, found["roof"]), points))
 
 
+lines = load("../studies/lines")
+
+
 def test_lines__are_trained_on_by_their_recipe() -> None:
-    training = Training.of("universal-lines", load("../studies/lines").mixture())
+    training = Training.of("universal", lines.mixture())
     assert {line.scenario.vehicles for line in training.lines} == {2, 3, 4, 5, 6, 8}
     assert {body for line in training.lines for body in line.scenario.learners} == {*range(1, 9)}
     assert sum(line.recipe.n_envs for line in training.lines) == pytest.approx(training.recipe.n_envs, rel=0.02)
