@@ -3,19 +3,24 @@
     python docs/studies/competence.py record
     python docs/studies/competence.py rule runs/lines/start
     python docs/studies/competence.py warning runs/lines/start
+    python docs/studies/competence.py search
     python docs/studies/competence.py table
 
 ``record`` writes the range of each shipped policy into its bundle. ``rule`` counts, for several rules, in how many
 lines the rule is right that a policy is worse than a rule-based agent; no line is a shipped scenario. ``warning``
 judges the chosen rule in the shipped scenarios. Both are for the policy of one test only, which is bad in many lines.
-``table`` compares agents in every shipped scenario, and in lines of 2 to 8 vehicles with each position as the learner
-(20 minutes of processor time). All costs are honest costs, means of ``WORLDS`` worlds.
+``table`` writes docs/results/lines.csv, which compares agents in every shipped scenario, and in lines of 2 to 8
+vehicles with each position as the learner. ``search`` adds the best known costs of lines that competence.json lacks.
+All costs are honest costs, means of ``WORLDS`` worlds.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import json
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,6 +40,9 @@ RULES = ((2, 0.0), (2, 0.05), (3, 0.0), (3, 0.05), (4, 0.0), (4, 0.05))  # featu
 AGENTS = {name: name for name in ("full_brake", "e_v2x_bm", "plan")}
 LEARNED = (POLICY, f"{POLICY}+step")
 LONGEST = 8
+BUDGET = 1000  # candidates in each world
+BEST = Path(__file__).with_suffix(".json")  # line -> best known honest cost
+TABLE = Path(__file__).parents[1] / "results" / "lines.csv"
 NO_COST = 0.1  # best known costs below this (m2/s2) have no ratio
 MORE, MORE_COST = 1.02, 0.05  # an agent is worse if its cost is above the other's by this factor, and this cost (m2/s2)
 
@@ -148,14 +156,6 @@ def warning(policy: str) -> None:
             print(f"{name}: alone {row['alone']:.2f}, with the plan {row['with the plan']:.2f}")
 
 
-def best_known(scenario: eb.Scenario) -> float:
-    """Least mean cost that a search finds; it also starts from the commands of the agents."""
-    game = open_game(scenario)[1]
-    teams = make_teams(",".join((*AGENTS, *LEARNED)), scenario, harm_count="honest").values()
-    found = search_list(game, scenario.sample(WORLDS, SEED), counts=("honest",), teams=teams, threads=1)
-    return float(found.harm["honest"].mean())
-
-
 def places() -> Iterator[tuple[str, eb.Scenario]]:
     """Lines of 2 to 8 vehicles, each with one learner."""
     for vehicles in range(2, LONGEST + 1):
@@ -163,51 +163,92 @@ def places() -> Iterator[tuple[str, eb.Scenario]]:
             yield f"{place} of {vehicles}", line(vehicles, place)
 
 
-def own_harm(scenario: eb.Scenario, row: Mapping[str, float]) -> str:
-    """Learners that bear more harm than under full braking, and how much more (m2/s2)."""
-    names = {i: f"total_harm_{i}" for i in scenario.learners}
-    more = {i: row[f"{POLICY} {name}"] - row[f"full_brake {name}"] for i, name in names.items()}
-    return ", ".join(f"{i}: +{extra:.1f}" for i, extra in more.items() if extra > MORE_COST)
+def search() -> None:
+    """Search the least cost of the lines that ``BEST`` lacks, starting also from the agents' commands."""
+    costs = json.loads(BEST.read_text())
+    for name, scenario in (*shipped().items(), *places()):
+        if name not in costs:
+            game = open_game(scenario)[1]
+            teams = make_teams(",".join((*AGENTS, POLICY)), scenario, harm_count="honest").values()
+            found = search_list(
+                game, scenario.sample(WORLDS, SEED), counts=("honest",), budget=BUDGET, teams=teams, threads=1
+            )
+            costs[name] = float(found.harm["honest"].mean())
+            BEST.write_text(json.dumps(costs, indent=1) + "\n")
+            print(name, costs[name], flush=True)
+
+
+def row_of(scenario: eb.Scenario, least: float) -> dict[str, Any]:
+    """Row of the table. ``least``: best known cost of a search."""
+    agents = dict.fromkeys((*AGENTS, *LEARNED))
+    means = costs(scenario, {agent: agent for agent in agents}, SEED, "pushed_mps,drove_towards")
+    harms = [f"total_harm_{body}" for body in scenario.learners]
+    return {
+        "learners": " ".join(map(str, scenario.learners)), "hidden": means["hidden"],
+        **{agent: means[agent] for agent in agents},
+        "best_known": min(least, *(means[agent] for agent in LEARNED)),
+        **{f"{agent}_push_mps": means[f"{agent} pushed_mps"] for agent in ("e_v2x_bm", POLICY)},
+        "drives": means[f"{POLICY} drove_towards"], "outside": means[f"{POLICY} outside"],
+        "more_own_harm": max(means[f"{POLICY} {harm}"] - means[f"full_brake {harm}"] for harm in harms),
+    }  # fmt: skip
 
 
 def table() -> None:
-    """Print a Markdown table, and summaries."""
-    agents = dict.fromkeys((*AGENTS, *LEARNED))
-    print("| line | full braking | E-V2X-BM | plan | `universal` | `+step` | best known | push | drives | own harm |")
-    print("| --- |" + " ---: |" * 9)
-    ratios: dict[bool, dict[str, float]] = {False: {}, True: {}}
-    worse, over = {agent: [] for agent in LEARNED}, []
+    """Write ``TABLE``, and print a summary."""
+    best, rows = json.loads(BEST.read_text()), {}
     for name, scenario in (*shipped().items(), *places()):
-        row = costs(scenario, {agent: agent for agent in agents}, SEED, "pushed_mps,drove_towards")
-        least = best_known(scenario)
-        rival = min(row["full_brake"], row["plan" if row["hidden"] else "e_v2x_bm"])
+        rows[name] = row_of(scenario, best[name])
+        print(name, rows[name], flush=True)
+    with TABLE.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["line", *next(iter(rows.values()))])
+        writer.writerows(
+            [name, *(f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row.values())]
+            for name, row in rows.items()
+        )
+    groups = {
+        "one learner": [name for name, row in rows.items() if not row["hidden"] and " " not in row["learners"]],
+        "several learners": [name for name, row in rows.items() if not row["hidden"] and " " in row["learners"]],
+        "hidden values": [name for name, row in rows.items() if row["hidden"]],
+    }
+    print("| lines | number | agent | worse than the better rule | median | worst |")
+    print("| --- | ---: | --- | --- | ---: | ---: |")
+    for group, names in groups.items():
         for agent in LEARNED:
-            worse[agent] += [name] if is_worse(row[agent], rival) else []
-        if not row["hidden"] and least >= NO_COST:
-            ratios[len(scenario.learners) > 1][name] = row[POLICY] / least
-        elif not row["hidden"] and row[POLICY] > least + NO_COST:
-            over.append(name)
-        numbers = [row["full_brake"], row["e_v2x_bm"], row["plan"], row[POLICY], row[f"{POLICY}+step"], least]
-        cells = [f"`{name}`" if scenario.name == name else name]
-        cells[0] += " †" if row["hidden"] else ""
-        cells += [f"{number:.2f}" for number in numbers] + [f"{row[f'{POLICY} pushed_mps']:.2f}"]
-        cells += [f"{row[f'{POLICY} drove_towards']:.1%}", own_harm(scenario, row)]
-        print(f"| {' | '.join(cells)} |", flush=True)
-    for agent, names in worse.items():
-        print(f"\n{agent} is worse than the better rule: {', '.join(names) or 'nowhere'}.")
-    for several, rows in ratios.items():
-        worst = max(rows, key=lambda name: rows[name])
-        who = "several learners" if several else "one learner"
-        print(f"{who}: median {np.median([*rows.values()]):.3f} times best known, worst {rows[worst]:.3f} ({worst}).")
-    print(f"Best known below {NO_COST}, and more than {NO_COST} above it: {', '.join(over) or 'nowhere'}.")
+            rules = {name: min(rows[name][rule] for rule in rules_of(rows[name])) for name in names}
+            worse = [name for name in names if is_worse(rows[name][agent], rules[name])]
+            known = {name: rows[name]["best_known"] for name in names}
+            ratios = {name: rows[name][agent] / known[name] for name in names if known[name] >= NO_COST}
+            worst = max(ratios, key=lambda name: ratios[name])
+            words = f"{len(worse)}{': ' if worse else ''}{', '.join(worse)}"
+            middle, end = np.median([*ratios.values()]), f"{ratios[worst]:.2f} ({worst})"
+            print(f"| {group} | {len(names)} | `{agent}` | {words} | {middle:.2f} | {end} |")
+    extremes = {
+        f"more cost, best known below {NO_COST}": {
+            name: row[POLICY] - row["best_known"] for name, row in rows.items() if row["best_known"] < NO_COST
+        },
+        "push beyond E-V2X-BM's": {
+            name: row[f"{POLICY}_push_mps"] - row["e_v2x_bm_push_mps"] for name, row in rows.items()
+        },
+        "driving before contact": {name: row["drives"] for name, row in rows.items()},
+        "harm of a learner beyond full braking's": {name: row["more_own_harm"] for name, row in rows.items()},
+    }
+    for title, values in extremes.items():
+        most = sorted(values, key=lambda name: -values[name])[:5]
+        print(f"{title}: {', '.join(f'{name} {values[name]:.3f}' for name in most)}")
+
+
+def rules_of(row: Mapping[str, Any]) -> tuple[str, str]:
+    """The rules that know what the vehicle knows."""
+    return ("full_brake", "plan" if row["hidden"] else "e_v2x_bm")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("record", "rule", "warning", "table"))
+    parser.add_argument("what", choices=("record", "rule", "warning", "search", "table"))
     parser.add_argument("policy", nargs="?", default=POLICY, help="shipped policy or run, for rule and warning")
     given = parser.parse_args()
     if given.what in ("rule", "warning"):
         {"rule": rule, "warning": warning}[given.what](given.policy)
     else:
-        {"record": record, "table": table}[given.what]()
+        {"record": record, "search": search, "table": table}[given.what]()
