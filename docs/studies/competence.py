@@ -1,27 +1,36 @@
 """Where the shipped policies are at home: their training ranges, the rule of the warning, and `universal` everywhere.
 
     python docs/studies/competence.py record
-    python docs/studies/competence.py rule
+    python docs/studies/competence.py rule runs/lines/start
+    python docs/studies/competence.py warning runs/lines/start
+    python docs/studies/competence.py search
     python docs/studies/competence.py table
 
-``record`` writes the range of each shipped policy into its bundle, from the fixed list of its training. ``rule``
-counts, for several rules, in how many lines the rule is right that ``universal`` alone is worse than a rule-based
-agent; no line is a shipped scenario. ``table`` compares agents in every shipped scenario, and judges the rule there.
+``record`` writes the range of each shipped policy into its bundle. ``rule`` counts, for several rules, in how many
+lines the rule is right that a policy is worse than a rule-based agent; no line is a shipped scenario. ``warning``
+judges the chosen rule in the shipped scenarios. Both are for the policy of one test only, which is bad in many lines.
+``table`` writes docs/results/lines.csv, which compares agents in every shipped scenario, and in lines of 2 to 8
+vehicles with each position as the learner. ``search`` adds the best known costs of lines that competence.json lacks.
 All costs are honest costs, means of ``WORLDS`` worlds.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+import csv
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.summary_row import OUTSIDE_SHARE
+from ethbrake_marl.extensions.search.best_harm import search_list
+from ethbrake_marl.names import make_teams, open_game
 from ethbrake_marl.policies import training_range
-from ethbrake_marl.policies.bundle import load_shipped, shipped_policies
+from ethbrake_marl.policies.bundle import load_named_policy, load_shipped, shipped_policies
 from ethbrake_marl.training.training_range import record_ranges
 
 POLICY, FALLBACK = "universal", "plan.action"
@@ -29,16 +38,25 @@ RECORDED_WORLDS, RECORDED_SEED = 4_000, 1007  # the seed is for bundles without 
 WORLDS, SEED, LINES_SEED = 300, 96_001, 96_002
 RULES = ((2, 0.0), (2, 0.05), (3, 0.0), (3, 0.05), (4, 0.0), (4, 0.05))  # features outside, margin
 AGENTS = {name: name for name in ("full_brake", "e_v2x_bm", "plan")}
+LEARNED = (POLICY, f"{POLICY}+step")
+LONGEST = 8
+BUDGET = 1000  # candidates in each world
+BEST = Path(__file__).with_suffix(".json")  # line -> best known honest cost
+TABLE = Path(__file__).parents[1] / "results" / "lines.csv"
+NO_COST = 0.1  # best known costs below this (m2/s2) have no ratio
 MORE, MORE_COST = 1.02, 0.05  # an agent is worse if its cost is above the other's by this factor, and this cost (m2/s2)
 
 
 def record() -> None:
+    from lines import mixture  # beside this file
+
     for name, folder in shipped_policies().items():
         policy = load_shipped(name)
         manifest = policy.manifest
         ranged = record_ranges(
-            dict.fromkeys(manifest.learners, policy), str(manifest.scenario["name"]), RECORDED_WORLDS,
-            manifest.seeds.get("evaluation", RECORDED_SEED), FALLBACK if name == POLICY else "",
+            dict.fromkeys(manifest.learners, policy),
+            mixture() if name == POLICY else str(manifest.scenario["name"]),
+            RECORDED_WORLDS, manifest.seeds.get("evaluation", RECORDED_SEED), FALLBACK if name == POLICY else "",
         )  # fmt: skip
         next(iter(ranged.values())).save(folder / "policy", replace=True)
 
@@ -50,7 +68,7 @@ def line(vehicles: int, *learners: int, **more: Any) -> eb.Scenario:
     content = {
         "name": "line", "vehicles": vehicles, "roles": roles, "early_impacts": "keep", "speed_limit_mps": 40,
         "gaps_m": {"uniform": [5, 10]}, "speeds_mps": {"uniform": [18, 22]}, "restitution": 0.1,
-        "latency_s": [0, 0.5, 0.8, 0.5, 0.8, 0.5][:vehicles],
+        "latency_s": [0, *[0.5, 0.8] * 4][:vehicles],
         **{key: [values[i % len(values)] for i in range(vehicles)] for key, values in repeated.items()},
         **({"obstacle_gap_m": {"uniform": [38, 55]}} if 1 in learners else {}),
     }  # fmt: skip
@@ -79,20 +97,32 @@ def lines() -> dict[str, eb.Scenario]:
     return named
 
 
-def costs(scenario: eb.Scenario, agents: Any, seed: int) -> dict[str, float]:
-    """Honest cost of each agent, its share of decisions outside (``NAME outside``), and the share of hidden worlds."""
-    result = eb.evaluate(scenario, agents, episodes=WORLDS, seed=seed, harm_count="honest")
-    ranged = [agent for agent in result if "outside" in result[agent]]
+def shipped() -> dict[str, eb.Scenario]:
+    """Shipped scenarios that `universal` can drive."""
+    loaded = [eb.load_scenario(entry.name) for entry in eb.list_scenarios()]
+    return {scenario.name: scenario for scenario in loaded if scenario.learners and scenario.physics is None}
+
+
+def costs(scenario: eb.Scenario, agents: Any, seed: int, measures: str = "") -> dict[str, float]:
+    """Means: each agent's honest cost (``AGENT``) and numbers (``AGENT NAME``), and the share of hidden worlds."""
+    result = eb.evaluate(scenario, agents, episodes=WORLDS, seed=seed, harm_count="honest", measures=measures)
     means = {agent: float(result[agent]["honest_cost"].mean()) for agent in result}
-    means |= {f"{agent} outside": float(result[agent]["outside"].mean()) for agent in ranged}
+    for agent in result:
+        numbers = {name: values for name, values in result[agent].items() if values.dtype.kind in "bfi"}
+        means |= {f"{agent} {name}": float(values.mean()) for name, values in numbers.items()}
     return means | {"hidden": float(result.worlds["hidden"].mean())}
 
 
-def alone() -> eb.LearnedAgent:
-    """The policy without its fallback."""
-    policy = load_shipped(POLICY)
+def both(name: str) -> dict[str, eb.LearnedAgent]:
+    """A policy (name of a shipped one, or path of a run), without and with its fallback."""
+    policy = load_named_policy(name)
     known = policy.manifest.training_range
-    return eb.LearnedAgent(policy.with_range(known and known.model_copy(update={"fallback": ""})), "alone")
+    assert known is not None
+    fallbacks = {"alone": "", "with the plan": FALLBACK}
+    return {
+        title: eb.LearnedAgent(policy.with_range(known.model_copy(update={"fallback": fallback})), title)
+        for title, fallback in fallbacks.items()
+    }
 
 
 def is_worse(cost: float, limit: float) -> bool:
@@ -107,37 +137,118 @@ def quality(rows: Mapping[str, Mapping[str, float]]) -> str:
     return f"flags {len(flagged & bad)} of {len(bad)} bad and {len(flagged - bad)} of {good} good; misses {missed}"
 
 
-def rule() -> None:
+def rule(policy: str) -> None:
     known = {name: costs(scenario, AGENTS, LINES_SEED) for name, scenario in lines().items()}
     for features, margin in RULES:
         training_range.FEATURES_OUTSIDE, training_range.MARGIN = features, margin
-        agents = {"alone": alone(), POLICY: POLICY}
-        rows = {name: known[name] | costs(scenario, agents, LINES_SEED) for name, scenario in lines().items()}
-        ratio = np.exp(np.mean([np.log(row[POLICY] / row["plan"]) for row in rows.values()]))
-        print(
-            f"{features} features by {margin}: {quality(rows)}; {POLICY} / plan, geometric mean {ratio:.3f}", flush=True
-        )
+        rows = {name: known[name] | costs(scenario, both(policy), LINES_SEED) for name, scenario in lines().items()}
+        ratio = np.exp(np.mean([np.log(row["with the plan"] / row["plan"]) for row in rows.values()]))
+        words = f"{features} features by {margin}: {quality(rows)}"
+        print(f"{words}; with the plan / plan, geometric mean {ratio:.3f}", flush=True)
+
+
+def warning(policy: str) -> None:
+    """Print how well the warning tells where a policy is bad, and where its fallback makes a difference."""
+    rows = {name: costs(scenario, AGENTS | both(policy), SEED) for name, scenario in shipped().items()}
+    print(f"The warning {quality(rows)}.")
+    for name, row in rows.items():
+        if row["alone"] != row["with the plan"]:
+            print(f"{name}: alone {row['alone']:.2f}, with the plan {row['with the plan']:.2f}")
+
+
+def places() -> Iterator[tuple[str, eb.Scenario]]:
+    """Lines of 2 to 8 vehicles, each with one learner."""
+    for vehicles in range(2, LONGEST + 1):
+        for place in range(1, vehicles + 1):
+            yield f"{place} of {vehicles}", line(vehicles, place)
+
+
+def search() -> None:
+    """Search the least cost of the lines that ``BEST`` lacks, starting also from the agents' commands."""
+    costs = json.loads(BEST.read_text())
+    for name, scenario in (*shipped().items(), *places()):
+        if name not in costs:
+            game = open_game(scenario)[1]
+            teams = make_teams(",".join((*AGENTS, POLICY)), scenario, harm_count="honest").values()
+            found = search_list(
+                game, scenario.sample(WORLDS, SEED), counts=("honest",), budget=BUDGET, teams=teams, threads=1
+            )
+            costs[name] = float(found.harm["honest"].mean())
+            BEST.write_text(json.dumps(costs, indent=1) + "\n")
+            print(name, costs[name], flush=True)
+
+
+def row_of(scenario: eb.Scenario, least: float) -> dict[str, Any]:
+    """Row of the table. ``least``: best known cost of a search."""
+    agents = dict.fromkeys((*AGENTS, *LEARNED))
+    means = costs(scenario, {agent: agent for agent in agents}, SEED, "pushed_mps,drove_towards")
+    harms = [f"total_harm_{body}" for body in scenario.learners]
+    return {
+        "learners": " ".join(map(str, scenario.learners)), "hidden": means["hidden"],
+        **{agent: means[agent] for agent in agents},
+        "best_known": min(least, *(means[agent] for agent in LEARNED)),
+        **{f"{agent}_push_mps": means[f"{agent} pushed_mps"] for agent in ("e_v2x_bm", POLICY)},
+        "drives": means[f"{POLICY} drove_towards"], "outside": means[f"{POLICY} outside"],
+        "more_own_harm": max(means[f"{POLICY} {harm}"] - means[f"full_brake {harm}"] for harm in harms),
+    }  # fmt: skip
 
 
 def table() -> None:
-    """Print a Markdown table of all shipped scenarios, and those that remain worse than the better rule."""
-    agents = {**AGENTS, "alone": alone(), POLICY: POLICY, f"{POLICY}+step": f"{POLICY}+step"}
-    rows, remaining = {}, []
-    print(f"| scenario | {' | '.join(agents)} | outside |\n| --- |{' ---: |' * (len(agents) + 1)}")
-    for entry in eb.list_scenarios():
-        scenario = eb.load_scenario(entry.name)
-        if not scenario.learners or scenario.physics is not None:
-            continue
-        rows[entry.name] = row = costs(scenario, agents, SEED)
-        rival = "plan" if row["hidden"] else "e_v2x_bm"
-        if is_worse(row[POLICY], min(row["full_brake"], row[rival])):
-            remaining.append(entry.name)
-        cells = [f"{row[agent]:.2f}" for agent in agents] + [f"{100 * row[f'{POLICY} outside']:.0f} %"]
-        print(f"| `{entry.name}`{' †' if row['hidden'] else ''} | {' | '.join(cells)} |", flush=True)
-    print(f"\nThe warning {quality(rows)}.\nWorse than the better rule: {', '.join(remaining) or 'none'}.")
+    """Write ``TABLE``, and print a summary."""
+    best, rows = json.loads(BEST.read_text()), {}
+    for name, scenario in (*shipped().items(), *places()):
+        rows[name] = row_of(scenario, best[name])
+        print(name, rows[name], flush=True)
+    with TABLE.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["line", *next(iter(rows.values()))])
+        writer.writerows(
+            [name, *(f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row.values())]
+            for name, row in rows.items()
+        )
+    groups = {
+        "one learner": [name for name, row in rows.items() if not row["hidden"] and " " not in row["learners"]],
+        "several learners": [name for name, row in rows.items() if not row["hidden"] and " " in row["learners"]],
+        "hidden values": [name for name, row in rows.items() if row["hidden"]],
+    }
+    print("| lines | number | agent | worse than the better rule | median | worst |")
+    print("| --- | ---: | --- | --- | ---: | ---: |")
+    for group, names in groups.items():
+        for agent in LEARNED:
+            rules = {name: min(rows[name][rule] for rule in rules_of(rows[name])) for name in names}
+            worse = [name for name in names if is_worse(rows[name][agent], rules[name])]
+            known = {name: rows[name]["best_known"] for name in names}
+            ratios = {name: rows[name][agent] / known[name] for name in names if known[name] >= NO_COST}
+            worst = max(ratios, key=lambda name: ratios[name])
+            words = f"{len(worse)}{': ' if worse else ''}{', '.join(worse)}"
+            middle, end = np.median([*ratios.values()]), f"{ratios[worst]:.2f} ({worst})"
+            print(f"| {group} | {len(names)} | `{agent}` | {words} | {middle:.2f} | {end} |")
+    extremes = {
+        f"more cost, best known below {NO_COST}": {
+            name: row[POLICY] - row["best_known"] for name, row in rows.items() if row["best_known"] < NO_COST
+        },
+        "push beyond E-V2X-BM's": {
+            name: row[f"{POLICY}_push_mps"] - row["e_v2x_bm_push_mps"] for name, row in rows.items()
+        },
+        "driving before contact": {name: row["drives"] for name, row in rows.items()},
+        "harm of a learner beyond full braking's": {name: row["more_own_harm"] for name, row in rows.items()},
+    }
+    for title, values in extremes.items():
+        most = sorted(values, key=lambda name: -values[name])[:5]
+        print(f"{title}: {', '.join(f'{name} {values[name]:.3f}' for name in most)}")
+
+
+def rules_of(row: Mapping[str, Any]) -> tuple[str, str]:
+    """The rules that know what the vehicle knows."""
+    return ("full_brake", "plan" if row["hidden"] else "e_v2x_bm")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("record", "rule", "table"))
-    {"record": record, "rule": rule, "table": table}[parser.parse_args().what]()
+    parser.add_argument("what", choices=("record", "rule", "warning", "search", "table"))
+    parser.add_argument("policy", nargs="?", default=POLICY, help="shipped policy or run, for rule and warning")
+    given = parser.parse_args()
+    if given.what in ("rule", "warning"):
+        {"rule": rule, "warning": warning}[given.what](given.policy)
+    else:
+        {"record": record, "search": search, "table": table}[given.what]()

@@ -65,7 +65,7 @@ POLICY = Part(
     make_trained, form="policy@PATH", about="the policy of a run or bundle, trained by any algorithm", knows=MESSAGES
 )
 TEAM = Part(make_trained, form="team@RUN", about="the learners of a run, each with its policy", knows=MESSAGES)
-UNIVERSAL = _shipped("universal", "paper-random, the same without driving, and with an obstacle; honest cost")
+UNIVERSAL = _shipped("universal", "any vehicle of any line, honest cost")
 VINE_PAPER = _shipped("vine-paper", "paper-random, first-impact harm: it pushes")
 PPO_OBSTACLE = _shipped("ppo-obstacle", "paper-random-obstacle, first-impact harm")
 ROLLOUT_OBSTACLE = _shipped("rollout-obstacle", "paper-random-obstacle, total harm")

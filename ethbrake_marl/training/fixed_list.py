@@ -39,7 +39,8 @@ def drive_list(training: Training) -> Callable[[Mapping[str, Agent]], dict[str, 
     exact impacts), ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a learner's
     objective is not the harm of the line, there is also each learner's objective (``objective_vehicle_2``), and their
     mean ``objective``. In a mixture of lines every line has its share of the worlds, and ``relative_NAME`` is what is
-    minimised in the line NAME divided by that of full braking; ``objective`` is its mean over the worlds.
+    minimised in the line NAME divided by that of full braking; ``objective`` is its mean over the worlds. A metric that
+    not every line has, such as ``objective_vehicle_5``, is left out.
     """
     if training.scenario.lines:
         return _drive_lines(training.lines)

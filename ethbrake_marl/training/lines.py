@@ -46,7 +46,8 @@ class LinesVecEnv(VecEnv):
             part.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [value for part in self.environments for value in part.get_attr(attr_name, indices)]
+        values = [value for part in self.environments for value in part.get_attr(attr_name)]
+        return [values[row] for row in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         for part in self.environments:
@@ -60,4 +61,4 @@ class LinesVecEnv(VecEnv):
         ]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        return [False] * self.num_envs
+        return [False for _ in self._get_indices(indices)]

@@ -230,7 +230,7 @@ class Scenario(ScenarioPart):
         elif self.lines:  # not declared, because a declared value replaces those of the members
             longest = max(self.lines, key=lambda line: line.vehicles)
             learners = {name: LEARNER for line in self.lines for name, role in line.roles.items() if role == LEARNER}
-            self.__dict__ |= {"vehicles": longest.vehicles, "roles": longest.roles | learners}
+            self.__dict__ |= {"vehicles": longest.vehicles, "roles": Roles(longest.roles | learners)}
         return self
 
     def __repr__(self) -> str:
@@ -385,8 +385,9 @@ class Scenario(ScenarioPart):
     def with_learners(self, learners: Iterable[str]) -> Scenario:
         """The scenario with exactly these learners, such as ``["vehicle_2"]``. Former learners brake fully.
 
-        Raises ``InvalidInput`` for an unknown vehicle.
+        Raises ``InvalidInput`` for an unknown vehicle, and in a mixture of lines.
         """
+        require_one_line(self)
         if isinstance(learners, str) or not isinstance(learners, Iterable):
             raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
         other_roles = {name: "full_brake" if role == LEARNER else role for name, role in self.roles.items()}

@@ -10,6 +10,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
+from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.training import Training
 from tests.docs.site import DOCS, load
 
@@ -74,10 +75,29 @@ def test_morl_front__its_numbers_agree_with_each_other_and_with_full_braking() -
             assert measured["hypervolume_below_roof"] == pytest.approx(volume_below(np.full(3, found["roof"]), points))
 
 
+lines = load("../studies/lines")
+
+
 def test_lines__are_trained_on_by_their_recipe() -> None:
-    training = Training.of("universal-lines", load("../studies/lines").mixture())
+    training = Training.of("universal", lines.mixture())
     assert {line.scenario.vehicles for line in training.lines} == {2, 3, 4, 5, 6, 8}
     assert {body for line in training.lines for body in line.scenario.learners} == {*range(1, 9)}
     assert sum(line.recipe.n_envs for line in training.lines) == pytest.approx(training.recipe.n_envs, rel=0.02)
     for line in training.lines:
         assert line.scenario.sample(5, 7).vehicles == line.scenario.vehicles
+
+
+def test_competence__has_a_best_known_cost_of_every_line() -> None:
+    competence = load("../studies/competence")
+    best = json.loads(competence.BEST.read_text("utf-8"))
+    assert best.keys() == {*competence.shipped(), *dict(competence.places())}
+    assert len(best) > 80 and all(cost >= 0.0 for cost in best.values())
+
+
+def test_universal__was_trained_by_its_recipe_on_its_lines() -> None:
+    policy, recipe = load_shipped("universal"), eb.load_recipe("universal")
+    manifest = policy.manifest
+    assert manifest.scenario == lines.mixture().content()
+    assert policy.observation.names == eb.View(recipe.observation).names
+    assert (manifest.algorithm, manifest.network.policy_hidden) == (recipe.algorithm, recipe.network.policy)
+    assert recipe.total_steps <= manifest.steps < recipe.total_steps + 20_000

@@ -41,6 +41,8 @@ def test_mixture_of_lines__has_the_vehicles_of_the_longest_and_the_learners_of_a
     assert [line.learners for line in scenario.lines] == [(2,), (3, 5)]
     assert [line.vehicles for line in scenario.lines] == [3, 5]
     assert (scenario.vehicles, scenario.learners) == (5, (2, 3, 5))
+    with refused("roles of a scenario cannot be changed"):
+        scenario.roles["vehicle_2"] = "coast"
     again = eb.Scenario(**scenario.declared())
     assert again == scenario and again.lines == scenario.lines == eb.load_scenario("lines.yaml").lines
     assert {"vehicles", "roles"}.isdisjoint(scenario.content()) and len(scenario.content()["mixture"]) == 2
@@ -55,6 +57,7 @@ def test_mixture_of_lines__has_the_vehicles_of_the_longest_and_the_learners_of_a
         lambda: LINES.sample(2, 7),
         lambda: LINES.draw(2, 7),
         lambda: LINES.bounds("mass_t"),
+        lambda: LINES.with_learners(["vehicle_2"]),
         lambda: eb.parallel_env(LINES),
         lambda: eb.make_sb3_vec_env(LINES, 2),
         lambda: eb.evaluate(LINES, "full_brake", episodes=2),
@@ -91,6 +94,7 @@ def test_environment__has_the_rows_of_every_line_and_goes_on_from_a_snapshot() -
         for line, n in zip(LINES.lines, (6, 2), strict=True)
     ]
     assert environment.num_envs == 6 + 2 * 2
+    assert environment.get_attr("n", [0, 9]) == [6, 2] and environment.env_is_wrapped(object, [0, 9]) == [False, False]
     np.testing.assert_array_equal(environment.reset(), np.concatenate([part.reset() for part in parts]))
     actions, saved = np.linspace(-1, 1, 10)[:, np.newaxis], environment.snapshot()
     for _ in range(60):  # beyond the end of every episode

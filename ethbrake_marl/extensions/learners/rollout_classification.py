@@ -6,7 +6,8 @@ Source: Lagoudakis and Parr, Reinforcement Learning as Classification, 2003.
 from __future__ import annotations
 
 import copy
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -98,7 +99,7 @@ class RolloutClassificationModel(BranchingModel):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
 
-    def improve(self, visited: Any) -> None:
+    def improve(self, visited: Sequence[Visited]) -> None:
         """Try choices at visited decisions, store their extra costs, and train the network on stored decisions."""
         recipe, chooser = self.recipe, self.policy
         (decisions,) = visited

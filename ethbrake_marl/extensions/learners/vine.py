@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -108,7 +108,7 @@ class VineModel(BranchingModel):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
 
-    def improve(self, visited: Any) -> None:
+    def improve(self, visited: Sequence[Visited]) -> None:
         results = [self.try_out(decisions) for decisions in visited]
         self.train_actor(TrialResults(*(torch.cat(parts) for parts in zip(*results, strict=True))))
 

@@ -16,7 +16,8 @@ def test_shipped_policies__all_have_a_range_and_universal_has_the_plan_as_its_fa
 
 
 def test_universal__is_the_plan_where_nothing_is_as_in_its_training() -> None:
-    result = eb.evaluate("realistic-truck", "plan,universal", episodes=50)
+    trucks = eb.load_scenario("paper-random").replace(speeds_mps=55, speed_limit_mps=60, gaps_m=20, mass_t=60)
+    result = eb.evaluate(trucks, "plan,universal", episodes=50)
     assert (result["universal"]["outside"] == 1.0).all()
     np.testing.assert_array_equal(result["universal"]["honest_cost"], result["plan"]["honest_cost"])
     note = "range of the policy's training: universal in 100 %."
@@ -37,6 +38,9 @@ def test_universal__strikes_nobody_where_nobody_is_behind() -> None:
 
 
 def test_show__names_the_fallback(ethbrake: Command) -> None:
-    text = " ".join(ethbrake("agent", "show", "universal", "--scenario", "realistic-truck").out.split())
-    assert text.startswith("universal: vehicle_2 in mixture-three-tests, by vine. Outside the range of its training it")
-    assert "it follows plan.action. In realistic-truck, 100 % of its decisions are outside." in text
+    text = " ".join(ethbrake("agent", "show", "universal", "--scenario", "paper-random").out.split())
+    assert text.startswith("universal: vehicle_1, vehicle_2, vehicle_3, vehicle_4")
+    assert (
+        "vehicle_8 in lines, by vine. Outside the range of its training it follows plan.action. In paper-random, 0 %"
+        in text
+    )
