@@ -3,8 +3,7 @@
 The programs of docs/train.md and docs/libraries.md run, too, in the environment of BenchMARL. Each library
 has its own environment in ``.venvs/``; one that cannot be installed is skipped with the reason. A policy is evaluated
 on a fixed list of worlds, together with full braking, and compared, world by world, with the library's own evaluation
-if there is one. docs/libraries.md has the printed rows that beat full braking. ``--ci`` runs only the libraries that
-are cheap to install.
+if there is one. ``--ci`` runs only the libraries that are cheap to install.
 """
 
 import json
