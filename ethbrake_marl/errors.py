@@ -238,6 +238,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"known: {', '.join(names) or 'none'}{advice}"
     first = re.split("[,:+@]", text)[0]
     tables = {other: resolve_name(place) for other, place in NAMES.items() if kind in NAMES and other != kind}
+    if may_be_own and text.endswith(".py"):
+        hint = f"write {text}:FUNCTION"
     others = [other for other, table in tables.items() if first in (table() if callable(table) else table)]
     if others:
         hint = f"{first!r} names another kind: {', '.join(others)}; were two values swapped?"

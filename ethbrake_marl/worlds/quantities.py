@@ -102,26 +102,26 @@ class Rule(NamedTuple):
 _USUAL = (
     Rule(
         "gaps_m", "m", "pair", 1e4, False, 0,
-        "bumper-to-bumper gap of each pair at the alert, front to rear", "[7, 7]", "gap_{}_m",
+        "bumper-to-bumper gap of each pair at the alert, front to rear", "7", "gap_{}_m",
     ),
     Rule(
         "speeds_mps", "mps", "vehicle", 200.0, False, 1,
-        "speed of each vehicle at the alert", "[20, 18, 20]", "speed_{}_mps",
+        "speed of each vehicle at the alert", "20", "speed_{}_mps",
     ),
     Rule(
         "braking_capacity_mps2", "mps2", "vehicle", 100.0, True, 2,
-        "largest deceleration of each vehicle", "[6, 7, 6]", "braking_capacity_{}_mps2",
+        "largest deceleration of each vehicle", "7", "braking_capacity_{}_mps2",
     ),
     Rule(
         "driving_capacity_mps2", "mps2", "vehicle", 100.0, False, 3,
-        "largest forward acceleration of each vehicle", "[6, 7, 6]", "driving_capacity_{}_mps2",
+        "largest forward acceleration of each vehicle", "6", "driving_capacity_{}_mps2",
     ),
     Rule(
         "latency_s", "s", "vehicle", 3600.0, False, 4,
-        "time from the alert until a vehicle's commands take effect; until then it coasts", "[0, 0.5, 0.8]",
+        "time from the alert until a vehicle's commands take effect; until then it coasts", "0.5",
         "latency_{}_s",
     ),
-    Rule("mass_t", "t", "vehicle", 1000.0, True, 5, "mass of each vehicle", "[4.5, 5.5, 5.9]", "mass_{}_t"),
+    Rule("mass_t", "t", "vehicle", 1000.0, True, 5, "mass of each vehicle", "5", "mass_{}_t"),
     Rule(
         "speed_limit_mps", "mps", "vehicle", 200.0, True, 6,
         "speed at which each vehicle stops accelerating", "40", "speed_limit_{}_mps",

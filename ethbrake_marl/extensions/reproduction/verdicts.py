@@ -31,6 +31,7 @@ from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.motion.layout import Bools, Floats
 
 Verdict = Literal["agrees", "differs", "cannot be", "undecided", "not converged", "not run"]
+REASONS = {"not run": "needs a training: ethbrake reproduce --full"}  # for every sentence without a reason of its own
 
 VERDICT_TOLERANCE = 0.02
 
@@ -66,7 +67,7 @@ def sentences_sheet(claims: Mapping[str, Mapping[str, Claim]], *, reasons: bool 
         item, name = sentence["result"].split("/")
         if item in claims:
             claim = claims[item].get(name, Claim(name, "", "", "not run"))
-            why = sentence["why"].get(claim.verdict, "") if reasons else ""
+            why = sentence["why"].get(claim.verdict, REASONS.get(claim.verdict, "")) if reasons else ""
             rows.append((sentence["where"], sentence["paper"], *claim[1:], why))
     return Sheet("", [Column(heading, text=True) for heading in COLUMNS], rows)
 
