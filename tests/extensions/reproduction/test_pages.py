@@ -16,7 +16,7 @@ from ethbrake_marl.extensions.reproduction.learning import Course
 from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import NON_E, SHIPPED_SPECS, report_outcome
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED
-from ethbrake_marl.extensions.reproduction.verdicts import Verdict, paper_texts
+from ethbrake_marl.extensions.reproduction.verdicts import REASONS, Verdict, paper_texts
 from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.site import DOCS, load
 
@@ -57,8 +57,8 @@ def test_results__have_a_number_in_each_row_that_was_run_and_the_reason_for_its_
     for row, sentence in zip(sentences(), SENTENCES, strict=True):
         *_, ours, _, verdict, why = row
         assert re.search(r"\d", ours) or verdict == "not run"
-        assert why == sentence["why"].get(verdict, "").strip()
-        assert why or verdict in ("agrees", "not run")
+        assert why == sentence["why"].get(verdict, REASONS.get(verdict, "")).strip()
+        assert why or verdict == "agrees"
 
 
 def test_readme__has_the_number_of_each_verdict() -> None:

@@ -30,7 +30,7 @@ MEANS = {  # harm of docs/least-harm.md, m2/s2: first-impact, total
 }  # fmt: skip
 
 COSTS = {  # honest cost of docs/results/benchmark.md, m2/s2
-    "benchmark-all": 0.720, "benchmark-blocked": 37.337, "benchmark-five": 1.580, "benchmark-noisy": 19.387,
+    "benchmark-all": 0.299, "benchmark-blocked": 37.337, "benchmark-five": 0.436, "benchmark-noisy": 19.387,
     "benchmark-pair": 14.246, "benchmark-truck": 17.754,
 }  # fmt: skip
 
