@@ -77,6 +77,18 @@ def test_benchmark__of_one_task_has_the_rows_of_the_group(ethbrake: Command, emp
     assert float(all_rows[0][table.SHARE]) == 0.0 and table.shares_of(cells, "benchmark-pair", "full_brake").value == 0
 
 
+@pytest.mark.parametrize("other", ["--seed 8", "--episodes 2001", "--set v2x=congested"])
+def test_benchmark__in_worlds_without_a_best_known_cost_has_no_share(
+    ethbrake: Command, empty_folder: Path, other: str
+) -> None:
+    words = "evaluate --scenario benchmark-pair --agents full_brake --json --output new --episodes 20"
+    [row] = told_json(ethbrake(*words.split(), *other.split()))
+    [written] = rows_of(Path("new/rows.csv"))
+    assert written[table.SHARE] == "" and float(written["worst5_honest"]) == row["worst5_honest"] > 0.0
+    with refused("has no share of the possible reduction"):
+        table.read_rows([Path("new/rows.csv")])
+
+
 def test_table__shows_the_middle_three_of_five_seeds_on_the_scale(tmp_path: Path) -> None:
     # without the best and the worst seed: mean 46 / 3; (30 - 46 / 3) / (30 - 10) = 73.3 %
     seeds = [
