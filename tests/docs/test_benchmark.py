@@ -116,9 +116,11 @@ def test_table__shows_the_middle_three_of_five_seeds_on_the_scale(tmp_path: Path
 
 
 def test_table__refuses_rows_of_other_worlds_and_rows_without_a_share(tmp_path: Path) -> None:
-    mine, other = ({"agent": "m", **more} for more in ({}, {"worlds_sha256": "c"}))
-    with refused("has other worlds or another physics than other files"):
-        table.read_rows([rows_file(tmp_path / "a.csv", mine), rows_file(tmp_path / "b.csv", other)])
+    mine = {"agent": "m"}
+    for name, value in (("worlds_sha256", "c"), ("physics_digest", "c"), ("best_known_honest", "11")):
+        files = [rows_file(tmp_path / "a.csv", mine), rows_file(tmp_path / "b.csv", {"agent": "n", name: value})]
+        with refused(f"b.csv: t, n: {name} = {value}, but "):
+            table.read_rows(files)
     with refused("a.csv: t, m: has no share of the possible reduction; evaluate full_brake beside it"):
         table.read_rows([rows_file(tmp_path / "a.csv", {**mine, table.SHARE: ""})])
 
@@ -127,6 +129,8 @@ def test_table__refuses_what_must_not_be_one_row(tmp_path: Path) -> None:
     first = {"agent": "m", "seed": 0, "decisions": 200}
     for change, message in (
         ({}, "another row has the same seed"),
+        ({"seed": "00"}, "another row has the same seed"),
+        ({"seed": 1, "sees_through_channel": "True"}, "sees_through_channel = True, but False in another row"),
         ({"seed": 1, "decisions": 900}, "decisions = 900, but 200 in another row"),
         ({"seed": 1, "version": "0.1.0"}, "version = 0.1.0, but"),
     ):
@@ -136,6 +140,57 @@ def test_table__refuses_what_must_not_be_one_row(tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_text("task,harm\nt,1\n")
     with refused("c.csv: lacks the column worlds_sha256; must have rows of run.py or of evaluate"):
         table.read_rows([tmp_path / "c.csv"])
+    with refused("no rows"):
+        table.read_rows([])
+
+
+def test_table__refuses_a_file_that_lacks_a_column_or_rows(tmp_path: Path) -> None:
+    file = tmp_path / "a.csv"
+    rows = rows_of(rows_file(file, {"agent": "m"}))
+    for name in ("task", "agent", "physics_digest", "honest_cost", "sees_through_channel", "best_known_honest"):
+        file.write_text(csv_text([{key: value for key, value in row.items() if key != name} for row in rows]))
+        with refused(f"a.csv: lacks the column {name}"):
+            table.read_rows([file])
+    for content, message in (
+        (b"", "a.csv: lacks the column task"),
+        (",".join(rows[0]).encode(), "a.csv: has no rows"),
+        (b"task\n\xff\xfe\n", "a.csv: is no CSV file in UTF-8"),
+    ):
+        file.write_bytes(content)
+        with refused(message):
+            table.read_rows([file])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "right"),
+    [
+        (table.SHARE, "nan", "a finite number"),
+        ("honest_cost", "inf", "a finite number"),
+        ("best_known_honest", "", "a finite number"),
+        ("total_harm", "much", "a finite number"),
+        ("cpu_s", "long", "a finite number"),
+        ("seed", "0.5", "a whole number"),
+        ("decisions", "many", "a whole number"),
+        ("method", "a|b", "a name without |"),
+        ("task", "", "a name without |"),
+        ("sees_through_channel", "true", "True or False"),
+    ],
+)
+def test_table__refuses_a_value(tmp_path: Path, name: str, value: str, right: str) -> None:
+    row = {table.SHARE: "0.5", "task": "t", "agent": "m", **SCALE, **MEANS, **IDENTITY}
+    (tmp_path / "a.csv").write_text(csv_text([{**row, name: value}]))
+    with refused(f": {name} = {value!r}: must be {right}"):
+        table.read_rows([tmp_path / "a.csv"])
+
+
+def test_figure__has_a_panel_for_each_task_with_several_seeds(tmp_path: Path) -> None:
+    one_seed = [{"agent": "m", "task": task} for task in "abc"]
+    with refused("--figure: needs a method with two seeds or more"):
+        table.draw(table.read_rows([rows_file(tmp_path / "a.csv", *one_seed)]))
+    rows = [{**row, "seed": seed} for row in one_seed for seed in (0, 1)]
+    figure = table.draw(table.read_rows([rows_file(tmp_path / "a.csv", *rows)]))
+    assert [axes.get_title("left") for axes in figure.axes] == [*"abc"]
+    assert [axes.xaxis.get_tick_params()["labelbottom"] for axes in figure.axes] == [False, True, True]
 
 
 def test_differences__of_two_methods_and_of_two_tasks_by_hand(tmp_path: Path) -> None:
