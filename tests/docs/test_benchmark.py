@@ -109,7 +109,8 @@ def test_table__shows_the_middle_three_of_five_seeds_on_the_scale(tmp_path: Path
     assert [row["share of the possible"] for row in (first, last, best)] == ["90.0 %", "0.0 %", "100.0 %"]
     assert best["honest cost"] == "10.00" and best.keys() == second.keys()
     shares = {row["method"]: row["t"] for row in table.overview(cells)}
-    assert shares["m"] == second["share of the possible"] and shares["full braking, honest cost"] == "30.00"
+    assert shares["m"] == second["share of the possible"] and shares["omniscient"] == "90.0 % †"
+    assert shares["full braking, honest cost"] == "30.00"
     figure = tmp_path / "figure.png"
     table.write_picture(figure, table.draw(cells), force=True)
     assert figure.read_bytes().startswith(PNG)

@@ -6,8 +6,8 @@
 
 Rows come from `train/benchmark/run.py` (one for each task, method and seed) and from `ethbrake evaluate --scenario
 benchmark --output` (one for each task and agent). The first table has the share of the possible reduction (0 for full
-braking, 1 for the best known cost); the second table, also written by `--csv`, has all measures. For the committed
-rows, two more tables follow: differences in honest cost, and cross-play.
+braking, 1 for the best known cost); the second table, also written by `--csv`, has all measures. Both mark agents that
+read hidden values (†). For the committed rows, two more tables follow: differences in honest cost, and cross-play.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from scipy.stats import trim_mean
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, write_picture
-from ethbrake_marl.files.sheet import Column, Estimate, csv_text
+from ethbrake_marl.files.sheet import DASH, Column, Estimate, csv_text
 from ethbrake_marl.files.store import write_file
 from ethbrake_marl.motion.layout import Floats
 
@@ -143,6 +143,11 @@ def shares_of(cells: Cells, task: str, method: str) -> Estimate:
     return interquartile_mean(float(row[SHARE]) for row in cells[task, method])
 
 
+def mark_of(cells: Cells, task: str, method: str) -> str:
+    """Mark of an agent that reads values which the channel hides in this task."""
+    return " †" if cells[task, method][0]["sees_through_channel"] == "True" else ""
+
+
 def methods_of(cells: Cells, task: str) -> list[str]:
     """Methods with rows of a task, the best first."""
     methods = [method for at, method in cells if at == task]
@@ -160,7 +165,7 @@ def table(cells: Cells) -> list[dict[str, str]]:
             means = {name: interquartile_mean(float(row[key]) for row in seeds).value for key, name in MEANS.items()}
             rows.append({
                 "task": task,
-                "method": f"{method}{' †' if seeds[0]['sees_through_channel'] == 'True' else ''}",
+                "method": method + mark_of(cells, task, method),
                 "seeds": f"{len(seeds)}",
                 "decisions": f"{int(decisions):,}" if decisions else "",
                 "CPU s": f"{np.mean(spent):.0f}" if spent else "",
@@ -183,13 +188,15 @@ def overview(cells: Cells) -> list[dict[str, str]]:
     """The share of each method (row) in each task (column), the best mean first, and the scale."""
     tasks = tasks_of(cells)
     shares: dict[str, dict[str, Estimate]] = defaultdict(dict)
+    texts: dict[str, dict[str, str]] = defaultdict(lambda: dict.fromkeys(tasks, DASH))
     for task, method in cells:
         shares[method][task] = shares_of(cells, task, method)
+        texts[method][task] = PERCENT.show(shares[method][task]).in_words + mark_of(cells, task, method)
     rows = []
     for method in sorted(shares, key=lambda method: -np.mean([share.value for share in shares[method].values()])):
-        rows.append({"method": method} | {task: PERCENT.show(shares[method].get(task)).in_words for task in tasks})
+        rows.append({"method": method} | texts[method])
     full = {task: cells[task, "full_brake"][0]["honest_cost"] for task in tasks if (task, "full_brake") in cells}
-    costs = {task: f"{float(full[task]):.2f}" if task in full else "–" for task in tasks}
+    costs = {task: f"{float(full[task]):.2f}" if task in full else DASH for task in tasks}
     rows.append({"method": "full braking, honest cost"} | costs)
     rows.append({"method": "best known, honest cost"} | {task: best_known(cells, task) for task in tasks})
     return rows
