@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+import runpy
 import sys
+from functools import partial
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +15,11 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import benchmark
 from ethbrake_marl.evaluation.benchmark import benchmark_rows, evaluate_task
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.files.sheet import csv_text
+from ethbrake_marl.names import group
 from tests.docs.site import load
 from tests.fixtures.commands import Command, rows_of, told_json
 from tests.refused import refused
@@ -243,8 +248,8 @@ def test_figure__is_drawn_from_the_committed_rows() -> None:
 
 
 def test_cross_play__of_two_teams_by_hand() -> None:
-    cost = cross_play.cross_play("benchmark-pair", ["full_brake", "constant:5"])
-    assert cost.shape == (2, 2, 2000)
+    names, cost = cross_play.cross_play("benchmark-pair", ["full_brake", "constant:5"])
+    assert names == ["full_brake", "constant:5"] and cost.shape == (2, 2, 2000)
     drivers = {"vehicle_2": "full_brake", "vehicle_3": "constant:5"}
     mixed = eb.evaluate("benchmark-pair", {"mixed": drivers}, episodes=2000)["mixed"]["honest_cost"]
     assert cost[0, 1].tolist() == mixed.tolist()
@@ -252,17 +257,37 @@ def test_cross_play__of_two_teams_by_hand() -> None:
         cross_play.cross_play("benchmark-single", ["full_brake", "constant:5"])
 
 
+def run_script(monkeypatch: pytest.MonkeyPatch, name: str, *words: str) -> None:
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", *words])
+    runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
+
+
+def test_cross_play__of_a_group_names_each_of_its_teams(
+    empty_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmark, "evaluate_task", partial(evaluate_task, episodes=3))
+    run_script(monkeypatch, "cross_play", "benchmark-pair", "field", "coast", "--csv", "matrix.csv")
+    teams = [*group("field"), "coast"]
+    assert [(row["front"], row["others"]) for row in rows_of(Path("matrix.csv"))] == [*product(teams, teams)]
+    assert "on the diagonal" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", ["cross_play benchmark-pair coast full_brake --csv", "table --csv", "table --figure"])
+def test_file__that_cannot_be_written_is_refused_before_the_work(
+    empty_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: str
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        run_script(monkeypatch, *words.split(), "none/x.png")
+    out, err = capsys.readouterr()
+    assert out == "" and "the folder none does not exist; create it first" in err
+
+
 def test_data__of_a_task_has_the_same_digest_twice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import runpy
-
     pytest.importorskip("pyarrow")
     for name in ("one", "two"):
-        monkeypatch.setattr(
-            sys, "argv", ["data.py", "benchmark-all", str(tmp_path / f"{name}.parquet"), "--episodes", "3"]
-        )
-        runpy.run_path(str(FOLDER / "data.py"), run_name="__main__")
+        run_script(monkeypatch, "data", "benchmark-all", str(tmp_path / f"{name}.parquet"), "--episodes", "3")
     one, two = (line.rpartition(" ")[2] for line in capsys.readouterr().out.splitlines())
     assert one == two == data.digest(tmp_path / "one.parquet")
 

@@ -26,7 +26,7 @@ from scipy.stats import trim_mean
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, write_picture
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, csv_text
-from ethbrake_marl.files.store import write_file
+from ethbrake_marl.files.store import check_target, write_file
 from ethbrake_marl.motion.layout import Floats
 
 ROWS = Path(__file__).resolve().parents[2] / "docs" / "results" / "benchmark"
@@ -285,14 +285,17 @@ if __name__ == "__main__":
     parser.add_argument("--figure", type=Path, help="also draw the figure to this file")
     args = parser.parse_args()
     try:
+        for path in filter(None, (args.csv, args.figure)):
+            check_target(path, force=True)
         cells = read_rows(args.rows or ROWS.glob("*.csv"))
+        figure = draw(cells) if args.figure else None
         tables = [overview(cells), table(cells)]
         if not args.rows:
             tables += [differences(cells), cross_play(CROSS_PLAY.glob("*.csv"))]
         print("\n\n".join(text_of(rows) for rows in tables))
         if args.csv:
             write_file(args.csv, csv_text(table(cells)).encode())
-        if args.figure:
-            write_picture(args.figure, draw(cells), force=True)
+        if figure:
+            write_picture(args.figure, figure, force=True)
     except (InvalidInput, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
