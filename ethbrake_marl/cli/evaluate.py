@@ -68,7 +68,7 @@ def evaluate_command(
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.cli.settings import read_settings
-        from ethbrake_marl.evaluation.benchmark import BENCHMARK, COUNT, benchmark_measures
+        from ethbrake_marl.evaluation.benchmark import BENCHMARK
         from ethbrake_marl.worlds.catalogue import THREE_TESTS, group_of_scenarios
 
         chosen = read_settings(settings, of_command=("harm_count", "measures"))
@@ -85,14 +85,11 @@ def evaluate_command(
                 f"--report: records episodes, which needs exact impacts, and physics: {physics} has none; leave it out"
             )
         is_benchmark = scenario in (BENCHMARK, *group_of_scenarios(BENCHMARK))
-        if is_benchmark:
-            measures = ",".join(filter(None, [chosen.command.get("measures"), *benchmark_measures()]))
-            chosen = chosen._replace(command={"harm_count": COUNT, **chosen.command, "measures": measures})
         comparisons = {}
         for name in names or [scenario]:
             usual = GROUP_EPISODES if is_benchmark or (names and name not in THREE_TESTS) else 10_000
             count = usual if episodes is None else episodes
-            comparisons[name] = _compare(out, name, chosen, agents, count, seed, jobs)
+            comparisons[name] = _compare(out, name, chosen, agents, count, seed, jobs, is_benchmark=is_benchmark)
         if report and output is not None:
             write = page_function("evaluation", "--report")
             output.mkdir(parents=True, exist_ok=True)
@@ -102,13 +99,18 @@ def evaluate_command(
 
 
 def _compare(
-    out: Out, scenario: str, chosen: CommandSettings, agents: str, episodes: int, seed: int, jobs: int | None
-) -> Compared:
+    out: Out, scenario: str, chosen: CommandSettings, agents: str, episodes: int, seed: int, jobs: int | None, *,
+    is_benchmark: bool,
+) -> Compared:  # fmt: skip
+    from ethbrake_marl.evaluation.benchmark import COUNT, benchmark_measures
     from ethbrake_marl.evaluation.compared import Compared
     from ethbrake_marl.names import teams_of
 
-    harm_count, measures = chosen.command.get("harm_count", "first"), chosen.command.get("measures", "")
     loaded = chosen.change_scenario(scenario)
+    harm_count = chosen.command.get("harm_count", COUNT if is_benchmark else "first")
+    measures = chosen.command.get("measures", "")
+    if is_benchmark:
+        measures = ",".join(filter(None, [measures, *benchmark_measures(loaded, episodes=episodes, seed=seed)]))
     return Compared.of(
         loaded, teams_of(agents, loaded, harm_count=harm_count), episodes=episodes, seed=seed, harm_count=harm_count,
         measures=measures, jobs=jobs or 1, on_done=lambda worlds: out.progress("worlds", worlds, episodes),

@@ -13,6 +13,7 @@ from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.registry import DISTRIBUTION
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, load_scenario
 from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.scenario import Scenario
 
 BENCHMARK = "benchmark"  # group of scenarios, the tasks
 EPISODES = 2_000  # worlds of each task, from the evaluation list of seed ``SEED``
@@ -33,24 +34,26 @@ COLUMNS = (
 )
 NOTE = (
     "Means per world; harm and cost in m²/s². Possible: 0 % for full braking, 100 % for the best known cost; it needs"
-    " the agent full_brake beside yours. Worst 5 %: mean honest cost of the worst 5 % of the worlds. Worst off: honest"
-    " cost that the worst-off vehicle of a world bears."
+    " the agent full_brake beside yours, and worlds of the benchmark's lists. Worst 5 %: mean honest cost of the worst"
+    " 5 % of the worlds. Worst off: honest cost that the worst-off vehicle of a world bears."
 )
 
 
-def benchmark_measures() -> list[str]:
-    """Names of the measures of ``COLUMNS`` as far as they are installed, except those of every evaluation."""
-    return ["worst5", "maximin", *(name for name in (BEST_KNOWN,) if name in MEASURES)]
+def benchmark_measures(scenario: Scenario, *, episodes: int, seed: int) -> list[str]:
+    """Names of the measures of ``COLUMNS`` as far as they are installed, except those of every evaluation.
+
+    The best known cost, and so the share of the possible, is measured only in the worlds of the benchmark's lists: the
+    first ``EPISODES`` worlds of ``SEED`` of a task without changes.
+    """
+    is_listed = scenario.name in group_of_scenarios(BENCHMARK) and seed == SEED and episodes <= EPISODES
+    is_listed = is_listed and scenario.content() == load_scenario(scenario.name).content()
+    return ["worst5", "maximin", *(name for name in (BEST_KNOWN,) if is_listed and name in MEASURES)]
 
 
 def evaluate_task(scenario: AnyScenario, agents: Any, *, episodes: int = EPISODES, seed: int = SEED) -> Result:
-    """Result of agents in the evaluation list of a task. Agents that choose minimise the honest cost.
-
-    The best known cost, and so the share of the possible, is measured only in the worlds of the benchmark's lists.
-    """
+    """Result of agents in the evaluation list of a task. Agents that choose minimise the honest cost."""
     loaded = load_scenario(scenario)
-    is_listed = loaded.name in group_of_scenarios(BENCHMARK) and seed == SEED and episodes <= EPISODES
-    measures = ["pushed_mps", *(name for name in benchmark_measures() if is_listed or name != BEST_KNOWN)]
+    measures = ["pushed_mps", *benchmark_measures(loaded, episodes=episodes, seed=seed)]
     return evaluate(loaded, agents, episodes=episodes, seed=seed, harm_count=COUNT, measures=measures)
 
 

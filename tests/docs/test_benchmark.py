@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+import runpy
 import sys
+from functools import partial
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +15,11 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import benchmark
 from ethbrake_marl.evaluation.benchmark import benchmark_rows, evaluate_task
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.files.sheet import csv_text
+from ethbrake_marl.names import group
 from tests.docs.site import load
 from tests.fixtures.commands import Command, rows_of, told_json
 from tests.refused import refused
@@ -77,6 +82,18 @@ def test_benchmark__of_one_task_has_the_rows_of_the_group(ethbrake: Command, emp
     assert float(all_rows[0][table.SHARE]) == 0.0 and table.shares_of(cells, "benchmark-pair", "full_brake").value == 0
 
 
+@pytest.mark.parametrize("other", ["--seed 8", "--episodes 2001", "--set v2x=congested"])
+def test_benchmark__in_worlds_without_a_best_known_cost_has_no_share(
+    ethbrake: Command, empty_folder: Path, other: str
+) -> None:
+    words = "evaluate --scenario benchmark-pair --agents full_brake --json --output new --episodes 20"
+    [row] = told_json(ethbrake(*words.split(), *other.split()))
+    [written] = rows_of(Path("new/rows.csv"))
+    assert written[table.SHARE] == "" and float(written["worst5_honest"]) == row["worst5_honest"] > 0.0
+    with refused("has no share of the possible reduction"):
+        table.read_rows([Path("new/rows.csv")])
+
+
 def test_table__shows_the_middle_three_of_five_seeds_on_the_scale(tmp_path: Path) -> None:
     # without the best and the worst seed: mean 46 / 3; (30 - 46 / 3) / (30 - 10) = 73.3 %
     seeds = [
@@ -97,16 +114,19 @@ def test_table__shows_the_middle_three_of_five_seeds_on_the_scale(tmp_path: Path
     assert [row["share of the possible"] for row in (first, last, best)] == ["90.0 %", "0.0 %", "100.0 %"]
     assert best["honest cost"] == "10.00" and best.keys() == second.keys()
     shares = {row["method"]: row["t"] for row in table.overview(cells)}
-    assert shares["m"] == second["share of the possible"] and shares["full braking, honest cost"] == "30.00"
+    assert shares["m"] == second["share of the possible"] and shares["omniscient"] == "90.0 % †"
+    assert shares["full braking, honest cost"] == "30.00"
     figure = tmp_path / "figure.png"
     table.write_picture(figure, table.draw(cells), force=True)
     assert figure.read_bytes().startswith(PNG)
 
 
 def test_table__refuses_rows_of_other_worlds_and_rows_without_a_share(tmp_path: Path) -> None:
-    mine, other = ({"agent": "m", **more} for more in ({}, {"worlds_sha256": "c"}))
-    with refused("has other worlds or another physics than other files"):
-        table.read_rows([rows_file(tmp_path / "a.csv", mine), rows_file(tmp_path / "b.csv", other)])
+    mine = {"agent": "m"}
+    for name, value in (("worlds_sha256", "c"), ("physics_digest", "c"), ("best_known_honest", "11")):
+        files = [rows_file(tmp_path / "a.csv", mine), rows_file(tmp_path / "b.csv", {"agent": "n", name: value})]
+        with refused(f"b.csv: t, n: {name} = {value}, but "):
+            table.read_rows(files)
     with refused("a.csv: t, m: has no share of the possible reduction; evaluate full_brake beside it"):
         table.read_rows([rows_file(tmp_path / "a.csv", {**mine, table.SHARE: ""})])
 
@@ -115,6 +135,8 @@ def test_table__refuses_what_must_not_be_one_row(tmp_path: Path) -> None:
     first = {"agent": "m", "seed": 0, "decisions": 200}
     for change, message in (
         ({}, "another row has the same seed"),
+        ({"seed": "00"}, "another row has the same seed"),
+        ({"seed": 1, "sees_through_channel": "True"}, "sees_through_channel = True, but False in another row"),
         ({"seed": 1, "decisions": 900}, "decisions = 900, but 200 in another row"),
         ({"seed": 1, "version": "0.1.0"}, "version = 0.1.0, but"),
     ):
@@ -124,6 +146,57 @@ def test_table__refuses_what_must_not_be_one_row(tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_text("task,harm\nt,1\n")
     with refused("c.csv: lacks the column worlds_sha256; must have rows of run.py or of evaluate"):
         table.read_rows([tmp_path / "c.csv"])
+    with refused("no rows"):
+        table.read_rows([])
+
+
+def test_table__refuses_a_file_that_lacks_a_column_or_rows(tmp_path: Path) -> None:
+    file = tmp_path / "a.csv"
+    rows = rows_of(rows_file(file, {"agent": "m"}))
+    for name in ("task", "agent", "physics_digest", "honest_cost", "sees_through_channel", "best_known_honest"):
+        file.write_text(csv_text([{key: value for key, value in row.items() if key != name} for row in rows]))
+        with refused(f"a.csv: lacks the column {name}"):
+            table.read_rows([file])
+    for content, message in (
+        (b"", "a.csv: lacks the column task"),
+        (",".join(rows[0]).encode(), "a.csv: has no rows"),
+        (b"task\n\xff\xfe\n", "a.csv: is no CSV file in UTF-8"),
+    ):
+        file.write_bytes(content)
+        with refused(message):
+            table.read_rows([file])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "right"),
+    [
+        (table.SHARE, "nan", "a finite number"),
+        ("honest_cost", "inf", "a finite number"),
+        ("best_known_honest", "", "a finite number"),
+        ("total_harm", "much", "a finite number"),
+        ("cpu_s", "long", "a finite number"),
+        ("seed", "0.5", "a whole number"),
+        ("decisions", "many", "a whole number"),
+        ("method", "a|b", "a name without |"),
+        ("task", "", "a name without |"),
+        ("sees_through_channel", "true", "True or False"),
+    ],
+)
+def test_table__refuses_a_value(tmp_path: Path, name: str, value: str, right: str) -> None:
+    row = {table.SHARE: "0.5", "task": "t", "agent": "m", **SCALE, **MEANS, **IDENTITY}
+    (tmp_path / "a.csv").write_text(csv_text([{**row, name: value}]))
+    with refused(f": {name} = {value!r}: must be {right}"):
+        table.read_rows([tmp_path / "a.csv"])
+
+
+def test_figure__has_a_panel_for_each_task_with_several_seeds(tmp_path: Path) -> None:
+    one_seed = [{"agent": "m", "task": task} for task in "abc"]
+    with refused("--figure: needs a method with two seeds or more"):
+        table.draw(table.read_rows([rows_file(tmp_path / "a.csv", *one_seed)]))
+    rows = [{**row, "seed": seed} for row in one_seed for seed in (0, 1)]
+    figure = table.draw(table.read_rows([rows_file(tmp_path / "a.csv", *rows)]))
+    assert [axes.get_title("left") for axes in figure.axes] == [*"abc"]
+    assert [axes.xaxis.get_tick_params()["labelbottom"] for axes in figure.axes] == [False, True, True]
 
 
 def test_differences__of_two_methods_and_of_two_tasks_by_hand(tmp_path: Path) -> None:
@@ -175,8 +248,8 @@ def test_figure__is_drawn_from_the_committed_rows() -> None:
 
 
 def test_cross_play__of_two_teams_by_hand() -> None:
-    cost = cross_play.cross_play("benchmark-pair", ["full_brake", "constant:5"])
-    assert cost.shape == (2, 2, 2000)
+    names, cost = cross_play.cross_play("benchmark-pair", ["full_brake", "constant:5"])
+    assert names == ["full_brake", "constant:5"] and cost.shape == (2, 2, 2000)
     drivers = {"vehicle_2": "full_brake", "vehicle_3": "constant:5"}
     mixed = eb.evaluate("benchmark-pair", {"mixed": drivers}, episodes=2000)["mixed"]["honest_cost"]
     assert cost[0, 1].tolist() == mixed.tolist()
@@ -184,17 +257,37 @@ def test_cross_play__of_two_teams_by_hand() -> None:
         cross_play.cross_play("benchmark-single", ["full_brake", "constant:5"])
 
 
+def run_script(monkeypatch: pytest.MonkeyPatch, name: str, *words: str) -> None:
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", *words])
+    runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
+
+
+def test_cross_play__of_a_group_names_each_of_its_teams(
+    empty_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmark, "evaluate_task", partial(evaluate_task, episodes=3))
+    run_script(monkeypatch, "cross_play", "benchmark-pair", "field", "coast", "--csv", "matrix.csv")
+    teams = [*group("field"), "coast"]
+    assert [(row["front"], row["others"]) for row in rows_of(Path("matrix.csv"))] == [*product(teams, teams)]
+    assert "on the diagonal" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", ["cross_play benchmark-pair coast full_brake --csv", "table --csv", "table --figure"])
+def test_file__that_cannot_be_written_is_refused_before_the_work(
+    empty_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: str
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        run_script(monkeypatch, *words.split(), "none/x.png")
+    out, err = capsys.readouterr()
+    assert out == "" and "the folder none does not exist; create it first" in err
+
+
 def test_data__of_a_task_has_the_same_digest_twice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import runpy
-
     pytest.importorskip("pyarrow")
     for name in ("one", "two"):
-        monkeypatch.setattr(
-            sys, "argv", ["data.py", "benchmark-all", str(tmp_path / f"{name}.parquet"), "--episodes", "3"]
-        )
-        runpy.run_path(str(FOLDER / "data.py"), run_name="__main__")
+        run_script(monkeypatch, "data", "benchmark-all", str(tmp_path / f"{name}.parquet"), "--episodes", "3")
     one, two = (line.rpartition(" ")[2] for line in capsys.readouterr().out.splitlines())
     assert one == two == data.digest(tmp_path / "one.parquet")
 

@@ -22,42 +22,47 @@ from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.benchmark import COUNT, evaluate_task
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.files.sheet import csv_text
-from ethbrake_marl.files.store import write_file
+from ethbrake_marl.files.store import check_target, write_file
 from ethbrake_marl.names import make_teams
 
 
-def cross_play(task: str, agents: Sequence[str]) -> NDArray[Any]:
-    """Honest cost of each world, [teams of the front learner, teams of the others, worlds] m2/s2."""
+def cross_play(task: str, agents: Sequence[str]) -> tuple[list[str], NDArray[Any]]:
+    """Names of the teams; honest cost of each world, [teams of the front learner, teams of the others, worlds] m2/s2.
+
+    A group of agents stands for several teams.
+    """
     scenario = eb.load_scenario(task)
     front, *others = scenario.learners
-    if not others or len(agents) < 2:
+    teams = make_teams(agents, scenario, harm_count=COUNT)
+    if not others or len(teams) < 2:
         raise InvalidInput(
             f"cross-play needs two agents or more, and two learners or more; {task} has {1 + len(others)}"
         )
-    teams = [*make_teams(agents, scenario, harm_count=COUNT).values()]
     mixed = {
         f"{i},{j}": eb.Team(f"{i},{j}", {**rear.drivers, front: first.drivers[front]})
-        for i, first in enumerate(teams)
-        for j, rear in enumerate(teams)
+        for i, first in enumerate(teams.values())
+        for j, rear in enumerate(teams.values())
     }
     result = evaluate_task(scenario, mixed)
-    return np.array([[result[f"{i},{j}"]["honest_cost"] for j in range(len(teams))] for i in range(len(teams))])
+    cost = [[result[f"{i},{j}"]["honest_cost"] for j in range(len(teams))] for i in range(len(teams))]
+    return [Path(name).name for name in teams], np.array(cost)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", help="name of a scenario with several learners")
-    parser.add_argument("agents", nargs="+", help="names of agents or teams")
+    parser.add_argument("agents", nargs="+", help="names of agents, teams or groups")
     parser.add_argument("--csv", type=Path, help="also write the matrix to this file")
     args = parser.parse_args()
     try:
-        cost = cross_play(args.task, args.agents)
         if args.csv:
-            names = [Path(agent).name for agent in args.agents]
+            check_target(args.csv, force=True)
+        names, cost = cross_play(args.task, args.agents)
+        if args.csv:
             pairings = [
-                {"task": args.task, "front": front, "others": others, "honest_cost": mean}
+                {"task": args.task, "front": front, "others": others, "honest_cost": value}
                 for front, row in zip(names, cost.mean(axis=2), strict=True)
-                for others, mean in zip(names, row, strict=True)
+                for others, value in zip(names, row, strict=True)
             ]
             write_file(args.csv, csv_text(pairings).encode())
     except (EthBrakeError, OSError) as error:

@@ -3,7 +3,8 @@
     python train/benchmark/run.py --tasks benchmark-pair --methods ippo mappo iql --output runs/benchmark
 
 IPPO: the critic of a learner has the observation of its actor. MAPPO: the critic has the state of the line. IQL: deep
-Q-learning of each learner with 9 discrete actions. What is not the library's default stands in `experiment_of`.
+Q-learning of each learner with 9 discrete actions. The last batch is a whole one, so 200,000 decisions may be up to
+202,752. What is not the library's default stands in `experiment_of`.
 """
 
 from __future__ import annotations

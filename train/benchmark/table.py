@@ -6,8 +6,8 @@
 
 Rows come from `train/benchmark/run.py` (one for each task, method and seed) and from `ethbrake evaluate --scenario
 benchmark --output` (one for each task and agent). The first table has the share of the possible reduction (0 for full
-braking, 1 for the best known cost); the second table, also written by `--csv`, has all measures. For the committed
-rows, two more tables follow: differences in honest cost, and cross-play.
+braking, 1 for the best known cost); the second table, also written by `--csv`, has all measures. Both mark agents that
+read hidden values (†). For the committed rows, two more tables follow: differences in honest cost, and cross-play.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from __future__ import annotations
 import argparse
 import csv
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from math import isfinite
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,8 @@ from scipy.stats import trim_mean
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, write_picture
-from ethbrake_marl.files.sheet import Column, Estimate, csv_text
-from ethbrake_marl.files.store import write_file
+from ethbrake_marl.files.sheet import DASH, Column, Estimate, csv_text
+from ethbrake_marl.files.store import check_target, write_file
 from ethbrake_marl.motion.layout import Floats
 
 ROWS = Path(__file__).resolve().parents[2] / "docs" / "results" / "benchmark"
@@ -41,37 +42,82 @@ MEANS = {  # column of the rows -> column of the table
     "collision_rate": "collisions",
     "pushed_mps": "push",
 }
+NUMBERS = (SHARE, "honest_cost", "best_known_honest", *MEANS)
+OF_A_TASK = ("worlds_sha256", "physics_digest", "best_known_honest")  # columns with one value in all rows of a task
+OF_A_METHOD = ("decisions", "version", "sees_through_channel")  # columns with one value in all seeds of a method
+NEEDED = ("task", "worlds_sha256", "physics_digest", "agent", "sees_through_channel", *NUMBERS)
+OPTIONAL = dict.fromkeys(("seed", "decisions", "cpu_s", "version"), "")
 PERCENT = Column("", digits=1, scale=100.0, unit=" %")
 
 
 def read_rows(files: Iterable[Path]) -> Cells:
     """Rows by task and method.
 
-    Raises `InvalidInput` for a file without the columns, a row without its share of the possible reduction, rows of
-    other worlds or physics than the task's first row, two rows of one seed, and rows of a method with other decisions
-    or another version than its first row.
+    Raises `InvalidInput` for a file that `checked_rows` refuses, rows that differ in `OF_A_TASK` from the task's first
+    row or in `OF_A_METHOD` from the method's first row, two rows of one seed, and no rows at all.
     """
     cells: Cells = defaultdict(list)
-    worlds: dict[str, tuple[str, str]] = {}
-    for file in sorted(files):
-        for row in csv.DictReader(file.read_text().splitlines()):
-            if missing := [name for name in ("task", "worlds_sha256", SHARE, *MEANS) if name not in row]:
-                raise InvalidInput(f"{file}: lacks the column {missing[0]}; must have rows of run.py or of evaluate")
-            identity = row["worlds_sha256"], row["physics_digest"]
-            if worlds.setdefault(row["task"], identity) != identity:
-                raise InvalidInput(f"{file}: {row['task']}: has other worlds or another physics than other files")
-            cell = cells[row["task"], row.get("method") or row["agent"]]
-            where = f"{file}: {row['task']}, {row.get('method') or row['agent']}"
-            if not row[SHARE]:
-                right = "evaluate full_brake beside it, in worlds of the benchmark's lists"
-                raise InvalidInput(f"{where}: has no share of the possible reduction; {right}")
-            if any(other.get("seed") == row.get("seed") for other in cell):
-                raise InvalidInput(f"{where}: another row has the same seed; leave one of them out")
-            for name in ("decisions", "version"):
-                if cell and cell[0].get(name) != row.get(name):
-                    raise InvalidInput(f"{where}: {name} = {row.get(name)}, but {cell[0].get(name)} in another row")
-            cell.append(row)
+    tasks: dict[str, Row] = {}
+    for row in (row for file in sorted(files) for row in checked_rows(file)):
+        first, cell = tasks.setdefault(row["task"], row), cells[row["task"], row["method"]]
+        if any(other["seed"] == row["seed"] for other in cell):
+            raise InvalidInput(f"{row['where']}: another row has the same seed; leave one of them out")
+        for name, other in [*((name, first) for name in OF_A_TASK), *((name, cell[0]) for name in OF_A_METHOD if cell)]:
+            if row[name] != other[name]:
+                raise InvalidInput(f"{row['where']}: {name} = {row[name]}, but {other[name]} in another row")
+        cell.append(row)
+    if not cells:
+        raise InvalidInput("no rows: needs a file of run.py or of evaluate")
     return cells
+
+
+def checked_rows(file: Path) -> Iterator[Row]:
+    """Rows of a file, each with its place (`where`) and with all columns of `OPTIONAL`. Numbers have one notation.
+
+    Raises `InvalidInput` for a file without rows or without a column, and for a value that is not as in `CHECKS`.
+    """
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as lines:
+            reader = csv.DictReader(lines, restval="")
+            rows, names = [*reader], reader.fieldnames or ()
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InvalidInput(f"{file}: is no CSV file in UTF-8 ({error})") from None
+    if missing := [name for name in NEEDED if name not in names]:
+        raise InvalidInput(f"{file}: lacks the column {missing[0]}; must have rows of run.py or of evaluate")
+    if not rows:
+        raise InvalidInput(f"{file}: has no rows")
+    for written in rows:
+        row = {**OPTIONAL, **written, "method": written.get("method") or written["agent"]}
+        row["where"] = f"{file}: {row['task']}, {row['method']}"
+        if not row[SHARE]:
+            right = "evaluate full_brake beside it, in worlds of the benchmark's lists"
+            raise InvalidInput(f"{row['where']}: has no share of the possible reduction; {right}")
+        for name, (is_right, right) in CHECKS.items():
+            if not (is_right(row[name]) or row[name] == OPTIONAL.get(name)):
+                raise InvalidInput(f"{row['where']}: {name} = {row[name]!r}: must be {right}")
+        row |= {name: f"{int(row[name])}" for name in ("seed", "decisions") if row[name]}
+        row["best_known_honest"] = f"{float(row['best_known_honest']):.9g}"  # machines may differ in the last digit
+        yield row
+
+
+def is_finite(text: str) -> bool:
+    try:
+        return isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def is_name(text: str) -> bool:
+    return bool(text) and text.isprintable() and "|" not in text
+
+
+CHECKS = {  # column -> what is right, in code and in words
+    "task": (is_name, "a name without |"),
+    "method": (is_name, "a name without |"),
+    **dict.fromkeys(("seed", "decisions"), (str.isdecimal, "a whole number")),
+    **dict.fromkeys((*NUMBERS, "cpu_s"), (is_finite, "a finite number")),
+    "sees_through_channel": (("True", "False").__contains__, "True or False"),
+}
 
 
 def interquartile_mean(values: Iterable[float]) -> Estimate:
@@ -97,6 +143,11 @@ def shares_of(cells: Cells, task: str, method: str) -> Estimate:
     return interquartile_mean(float(row[SHARE]) for row in cells[task, method])
 
 
+def mark_of(cells: Cells, task: str, method: str) -> str:
+    """Mark of an agent that reads values which the channel hides in this task."""
+    return " †" if cells[task, method][0]["sees_through_channel"] == "True" else ""
+
+
 def methods_of(cells: Cells, task: str) -> list[str]:
     """Methods with rows of a task, the best first."""
     methods = [method for at, method in cells if at == task]
@@ -109,12 +160,12 @@ def table(cells: Cells) -> list[dict[str, str]]:
     for task in tasks_of(cells):
         for method in methods_of(cells, task):
             seeds = cells[task, method]
-            spent = [float(row["cpu_s"]) for row in seeds if row.get("cpu_s")]
-            decisions = seeds[0].get("decisions")
+            spent = [float(row["cpu_s"]) for row in seeds if row["cpu_s"]]
+            decisions = seeds[0]["decisions"]
             means = {name: interquartile_mean(float(row[key]) for row in seeds).value for key, name in MEANS.items()}
             rows.append({
                 "task": task,
-                "method": f"{method}{' †' if seeds[0]['sees_through_channel'] == 'True' else ''}",
+                "method": method + mark_of(cells, task, method),
                 "seeds": f"{len(seeds)}",
                 "decisions": f"{int(decisions):,}" if decisions else "",
                 "CPU s": f"{np.mean(spent):.0f}" if spent else "",
@@ -137,13 +188,15 @@ def overview(cells: Cells) -> list[dict[str, str]]:
     """The share of each method (row) in each task (column), the best mean first, and the scale."""
     tasks = tasks_of(cells)
     shares: dict[str, dict[str, Estimate]] = defaultdict(dict)
+    texts: dict[str, dict[str, str]] = defaultdict(lambda: dict.fromkeys(tasks, DASH))
     for task, method in cells:
         shares[method][task] = shares_of(cells, task, method)
+        texts[method][task] = PERCENT.show(shares[method][task]).in_words + mark_of(cells, task, method)
     rows = []
     for method in sorted(shares, key=lambda method: -np.mean([share.value for share in shares[method].values()])):
-        rows.append({"method": method} | {task: PERCENT.show(shares[method].get(task)).in_words for task in tasks})
+        rows.append({"method": method} | texts[method])
     full = {task: cells[task, "full_brake"][0]["honest_cost"] for task in tasks if (task, "full_brake") in cells}
-    costs = {task: f"{float(full[task]):.2f}" if task in full else "–" for task in tasks}
+    costs = {task: f"{float(full[task]):.2f}" if task in full else DASH for task in tasks}
     rows.append({"method": "full braking, honest cost"} | costs)
     rows.append({"method": "best known, honest cost"} | {task: best_known(cells, task) for task in tasks})
     return rows
@@ -202,6 +255,8 @@ def draw(cells: Cells) -> Figure:
     A panel for each task in which a method has several seeds.
     """
     tasks = [task for task in tasks_of(cells) if any(len(rows) > 1 for (at, _), rows in cells.items() if at == task)]
+    if not tasks:
+        raise InvalidInput("--figure: needs a method with two seeds or more in a task; leave it out")
     rows = -(-len(tasks) // 2)
     figure, panels = new_panels((9.4, 2.8 * rows), rows, 2, sharex=True)
     for axes, task in zip(panels, tasks, strict=False):
@@ -212,6 +267,10 @@ def draw(cells: Cells) -> Figure:
         axes.errorbar(values[0], methods, xerr=ends, fmt="o", markersize=3, capsize=4)
         axes.axvline(100, color=GREY, linestyle="--", linewidth=1.1)
         axes.set(title=task)
+    for axes in panels[len(tasks) :]:
+        axes.remove()
+    for axes in panels[: len(tasks)][-2:]:  # the lowest panel of each column
+        axes.tick_params(labelbottom=True)
     return finish(
         figure,
         "Share of the possible reduction (%): 0 is full braking, 100 the best known. Interquartile means over seeds"
@@ -226,14 +285,17 @@ if __name__ == "__main__":
     parser.add_argument("--figure", type=Path, help="also draw the figure to this file")
     args = parser.parse_args()
     try:
+        for path in filter(None, (args.csv, args.figure)):
+            check_target(path, force=True)
         cells = read_rows(args.rows or ROWS.glob("*.csv"))
+        figure = draw(cells) if args.figure else None
         tables = [overview(cells), table(cells)]
         if not args.rows:
             tables += [differences(cells), cross_play(CROSS_PLAY.glob("*.csv"))]
         print("\n\n".join(text_of(rows) for rows in tables))
         if args.csv:
             write_file(args.csv, csv_text(table(cells)).encode())
-        if args.figure:
-            write_picture(args.figure, draw(cells), force=True)
+        if figure:
+            write_picture(args.figure, figure, force=True)
     except (InvalidInput, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
