@@ -8,8 +8,8 @@
 
 ``record`` writes the range of each shipped policy into its bundle. ``rule`` counts, for several rules, in how many
 lines the rule is right that a policy is worse than a rule-based agent; no line is a shipped scenario. ``warning``
-judges the chosen rule in the shipped scenarios. Both are for the policy of one test only, which is bad in many lines.
-``table`` writes docs/results/lines.csv, which compares agents in every shipped scenario, and in lines of 2 to 8
+judges the chosen rule in the shipped scenarios. Both are for the policy of the three tests only, which is bad in many
+lines. ``table`` writes docs/results/lines.csv, which compares agents in every shipped scenario, and in lines of 2 to 8
 vehicles with each position as the learner. ``search`` adds the best known costs of lines that competence.json lacks.
 All costs are honest costs, means of ``WORLDS`` worlds.
 """
@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 import ethbrake_marl as eb
+from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.evaluation.summary_row import OUTSIDE_SHARE
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.names import make_teams, open_game
@@ -246,9 +247,16 @@ def rules_of(row: Mapping[str, Any]) -> tuple[str, str]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("record", "rule", "warning", "search", "table"))
-    parser.add_argument("policy", nargs="?", default=POLICY, help="shipped policy or run, for rule and warning")
+    parser.add_argument("policy", nargs="?", help="shipped policy or run, for rule and warning only")
     given = parser.parse_args()
-    if given.what in ("rule", "warning"):
-        {"rule": rule, "warning": warning}[given.what](given.policy)
-    else:
-        {"record": record, "search": search, "table": table}[given.what]()
+    judges = {"rule": rule, "warning": warning}
+    if (given.what in judges) != (given.policy is not None):
+        needs = "needs a policy, such as runs/lines/start" if given.what in judges else "takes no policy"
+        parser.error(f"{given.what} {needs}")
+    try:
+        if given.what in judges:
+            judges[given.what](given.policy)
+        else:
+            {"record": record, "search": search, "table": table}[given.what]()
+    except (EthBrakeError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")

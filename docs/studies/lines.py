@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import ethbrake_marl as eb
+from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.training.job import Job
 from ethbrake_marl.training.training import Training
@@ -99,13 +100,20 @@ def train(recipe: str, scenario: eb.Scenario, folder: Path, **changes: Any) -> N
         raise SystemExit(f"stopped; the same command resumes {folder}")
 
 
+def train_both(folder: Path, seed: int) -> None:
+    tests, first = eb.load_scenario("mixture-three-tests"), folder / "three-tests"
+    train("three-tests", tests, first, seed=seed)
+    policies = record_ranges({"vehicle_2": eb.load_policy(first)}, tests, RANGE_WORLDS, RANGE_SEED)
+    policies["vehicle_2"].save(folder / "start", replace=True)
+    train("universal", mixture(), folder / "universal", seed=seed, start=f"policy@{folder / 'start'}")
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of both trainings")
     parser.add_argument("--seed", type=int, default=0, help="seed of both trainings")
     given = parser.parse_args()
-    tests, first = eb.load_scenario("mixture-three-tests"), given.folder / "three-tests"
-    train("three-tests", tests, first, seed=given.seed)
-    policies = record_ranges({"vehicle_2": eb.load_policy(first)}, tests, RANGE_WORLDS, RANGE_SEED)
-    policies["vehicle_2"].save(given.folder / "start", replace=True)
-    train("universal", mixture(), given.folder / "universal", seed=given.seed, start=f"policy@{given.folder / 'start'}")
+    try:
+        train_both(given.folder, given.seed)
+    except (EthBrakeError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")

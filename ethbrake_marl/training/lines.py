@@ -20,6 +20,10 @@ class LinesVecEnv(VecEnv):
         self.environments, first = environments, environments[0]
         super().__init__(sum(part.num_envs for part in environments), first.observation_space, first.action_space)
 
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Give every environment this seed, as ``make_environment`` does, so that trainings keep their worlds."""
+        return [row_seed for part in self.environments for row_seed in part.seed(seed)]
+
     def reset(self) -> Observations:
         return np.concatenate([part.reset() for part in self.environments])
 

@@ -15,7 +15,7 @@ AGENTS = {
     "e_v2x_bm": r"\[?E-V2X-BM \(coupled\).*|`?e_v2x_bm`?",
     "full_brake": r"full braking|`?full_brake`?|all vehicles brake fully",
     "best_harm": r"the best known.*|`?best_harm`?",
-    "universal": r"`?universal`?(, trained .*)?",
+    "universal": r"`?universal`?(, .*trained .*)?",
     "ppo": r"`?ppo`?([:,] .*trained .*)?",
 }
 CHOOSE = ("e_v2x_bm", "best_harm")  # what they do depends on what they minimise
@@ -111,13 +111,18 @@ def prose() -> Iterator[tuple[str, str]]:
 
 def test_number__of_an_agent_in_a_test_is_the_same_on_all_pages() -> None:
     found = all_facts()
-    assert len(found) > 90
+    assert len(found) > 93
     assert {key: shown for key, shown in found.items() if any(differ(a, b) for a in shown for b in shown)} == {}
+
+
+def test_readme__has_numbers_of_every_agent() -> None:
+    facts = of_page((ROOT / "README.md").read_text("utf-8"))
+    assert {agent for (agent, *_), _ in facts} == AGENTS.keys()
 
 
 def test_number__beside_full_braking_in_a_sentence_is_one_of_the_tables() -> None:
     tables = [number for (agent, *_), shown in all_facts().items() if agent == "full_brake" for number in shown]
-    beside = re.compile(r"(\d+\.\d\d) \(full braking\)|[Ff]ull braking (?:costs |does )?(\d+\.\d\d)(?! ?%)")
+    beside = re.compile(r"(\d+\.\d\d) \(full braking\)|[Ff]ull braking (?:costs |does )?(\d+\.\d\d)(?! ?%| more)")
     said = [(name, *filter(None, each.groups())) for name, text in prose() for each in beside.finditer(text)]
     assert len(said) > 5
     assert [each for each in said if all(differ(each[1], number) for number in tables)] == []

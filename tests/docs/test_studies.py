@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -85,6 +88,23 @@ def test_lines__are_trained_on_by_their_recipe() -> None:
     assert sum(line.recipe.n_envs for line in training.lines) == pytest.approx(training.recipe.n_envs, rel=0.02)
     for line in training.lines:
         assert line.scenario.sample(5, 7).vehicles == line.scenario.vehicles
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("lines.py {file}", "lines.py: error: "),
+        ("competence.py warning nix/nix", "competence.py: error: "),
+        ("competence.py rule", "competence.py: error: rule needs a policy, such as runs/lines/start"),
+    ],
+)
+def test_studies__end_with_a_message(words: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    study, *arguments = words.format(file=file).split()
+    command = [sys.executable, str(DOCS / "studies" / study), *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert ended.returncode == 2 and message in ended.stderr and "Traceback" not in ended.stderr
 
 
 def test_competence__has_a_best_known_cost_of_every_line() -> None:

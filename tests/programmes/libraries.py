@@ -1,9 +1,8 @@
 """Other libraries: every program of libraries.md in this folder runs unchanged, and its policy can be used as an agent.
 
-The programs of docs/train.md and docs/libraries.md run, too, in the environment of BenchMARL. Each library
-has its own environment in ``.venvs/``; one that cannot be installed is skipped with the reason. A policy is evaluated
-on a fixed list of worlds, together with full braking, and compared, world by world, with the library's own evaluation
-if there is one. ``--ci`` runs only the libraries that are cheap to install.
+Each library has its own environment in ``.venvs/``; one that cannot be installed is skipped with the reason. A policy
+is evaluated on a fixed list of worlds, together with full braking, and compared, world by world, with the library's own
+evaluation if there is one. ``--ci`` runs only the libraries that are cheap to install.
 """
 
 import json
@@ -17,16 +16,14 @@ import time
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from tests.programmes import KEPT, ROOT, Cases, Given, NotInstalled, Told, ready_python, watched
+from tests.programmes import KEPT, Cases, Given, NotInstalled, Told, ready_python, watched
 
 PAGE = Path(__file__).with_name("libraries.md")
-PROGRAMS = {"train.md": "## With a recipe", "libraries.md": "## On a GPU"}  # page of docs -> first heading behind
 SCENARIO, EPISODES, SEED = "paper-random", 500, 7
 OWN_EPISODES, CLOSE = 50, 1e-5  # worlds of the library's own evaluation, and tolerance in m2/s2
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -179,8 +176,7 @@ LIBRARIES = {  # by the heading of their section
     "CleanRL": Library(("moviepy==2.2.1",), "gymnasium", in_ci=True, finish=of_cleanrl),
     "TorchRL": Library(("torchrl==0.14.1",), in_ci=True, finish=of_torchrl),
     "BenchMARL": Library(
-        ("benchmarl==1.5.2", "torchrl<0.12", "tensordict<0.12", "stable-baselines3==2.9.2", "supersuit==3.11.0"),
-        finish=of_benchmarl,
+        ("benchmarl==1.5.2", "torchrl<0.12", "tensordict<0.12", "stable-baselines3==2.9.2"), finish=of_benchmarl
     ),
     "RLlib": Library(("ray[rllib]==2.60.0",)),
     "skrl": Library(("skrl==2.1.1",), finish=of_skrl),
@@ -235,27 +231,6 @@ def tell(k: int) -> None:
     print(json.dumps([version(library.told), harm, braking, own, f"{seconds:.0f}", verdict]))
 
 
-def harm_of_programs() -> dict[str, dict[str, float]]:
-    """Mean harm of full braking and of each policy of docs/train.md and docs/libraries.md.
-
-    Without BenchMARL only the programs of docs/train.md run.
-    """
-    names: dict[str, Any] = {"__name__": "copied"}
-    for page, end in [*PROGRAMS.items()][: 2 if find_spec("benchmarl") else 1]:
-        programs = (ROOT / "docs" / page).read_text("utf-8").partition(f"\n{end}\n")[0]
-        for code in re.findall("```python\n(.*?)```", programs, re.DOTALL):
-            exec(compile(code, page, "exec"), names)
-    for trained, harms in names["harm"].items():
-        full, theirs = harms.values()
-        assert theirs < full, f"{trained}: {theirs:.2f} does not beat full braking, {full:.2f}"
-    return names["harm"]
-
-
-def tell_programs() -> None:
-    """Run the programs in the current folder, and print the harm of each policy as JSON."""
-    print(json.dumps([f"{name} {harm:.2f}" for harms in harm_of_programs().values() for name, harm in harms.items()]))
-
-
 def evaluated_by_itself(model: Any, agent: Any) -> float:
     """Largest difference in a world's harm between our and the library's evaluation, m2/s2.
 
@@ -293,22 +268,20 @@ def cases(given: Given) -> Cases:
     taken = {library for library in LIBRARIES if LIBRARIES[library].in_ci or not given.ci}
     for k, way in enumerate(ways()):
         if way.library in taken:
-            yield f"{way.library}: {way.title} ({way.ran})", partial(run, way.library, f"tell({k})", given)
-    if "BenchMARL" in taken:
-        yield ("BenchMARL: docs/train.md, docs/libraries.md", partial(run, "BenchMARL", "tell_programs()", given))
+            yield f"{way.library}: {way.title} ({way.ran})", partial(run, way.library, k, given)
 
 
-def run(library: str, function: str, given: Given) -> Told:
-    """Run one program, or the programs of the pages, in the environment of its library."""
+def run(library: str, k: int, given: Given) -> Told:
+    """Run the k-th program in the environment of its library."""
     name = re.sub(r"\W+", "_", library.lower())
     try:
         python = ready_python(name, LIBRARIES[library].requires, LIBRARIES[library].overrides)
     except NotInstalled as reason:
         return Told(None, f"skipped: {reason}")
-    folder = KEPT / "work" / f"{name}-{re.sub(r'[^a-z0-9]+', '-', function)}"
+    folder = KEPT / "work" / f"{name}-{k}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    call = f"import os; os.chdir({str(folder)!r}); from tests.programmes import libraries; libraries.{function}"
+    call = f"import os; os.chdir({str(folder)!r}); from tests.programmes import libraries; libraries.tell({k})"
     variables = {"MINARI_DATASETS_PATH": str(folder), "PYTHONUNBUFFERED": "1", **ONE_THREAD}  # apart from the user's
     limit = min(given.limit, given.until - time.monotonic())
     status, told = watched([str(python), "-W", "ignore", "-c", call], limit, **variables)
@@ -319,8 +292,3 @@ def run(library: str, function: str, given: Given) -> Told:
         return Told(False, f"exit status {status}: {lines[-1]}")
     row = next(line for line in reversed(lines) if line.startswith('["'))  # a library may print something after it
     return Told(True, "  ".join(filter(None, json.loads(row))))
-
-
-def lowered(title: str) -> str:
-    """Title as it is written in the table."""
-    return title if title[:2].isupper() else title[0].lower() + title[1:]

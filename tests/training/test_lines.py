@@ -111,6 +111,20 @@ def test_environment__has_the_rows_of_every_line_and_goes_on_from_a_snapshot() -
     environment.close()
 
 
+def test_environment__repeats_the_worlds_of_a_seed() -> None:
+    environment = make_environment(TRAINING)
+    observations = []
+    for seed in (5, 5, 6, None):
+        assert len(set(environment.seed(seed))) <= 2 and len(environment.seed(seed)) == environment.num_envs
+        observations.append(environment.reset())
+    first, again, other, random = observations
+    np.testing.assert_array_equal(first, again)
+    for rows in (slice(6), slice(6, 10)):  # of each line
+        assert (first[rows] != other[rows]).any() and (first[rows] != random[rows]).any()
+    np.testing.assert_array_equal(first, make_environment(TRAINING._replace(recipe=TINY.replace(seed=5))).reset())
+    environment.close()
+
+
 def test_metrics__are_means_over_the_worlds_and_costs_relative_to_full_braking() -> None:
     agents = dict.fromkeys(TRAINING.learners, eb.make_agent("coast"))
     metrics, (first, second) = drive_list(TRAINING)(agents), TRAINING.lines

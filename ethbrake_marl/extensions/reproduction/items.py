@@ -24,6 +24,7 @@ from ethbrake_marl.extensions.reproduction.learning import (
     LOW,
     RANDOM,
     STOPPED,
+    check_runs,
     reproduce_curves,
     seconds_left,
     train_groups,
@@ -136,10 +137,11 @@ def reproduce(
 
     Trains policies that the folder of ``settings`` lacks, and writes figures, tables and a page to it. ``machine``:
     description of the computer, for the page. Raises ``AlreadyExists`` if the folder has results and ``force`` is
-    false.
+    false, and ``InvalidInput`` if a training there is not as planned.
     """
     folder, results = settings.folder, {}
     check_folder(folder, (RESULTS_FILE,), force=force)
+    check_runs(folder)
     if not train_groups(settings, groups_of(settings, items)):
         return None
     for number, item in enumerate(items):

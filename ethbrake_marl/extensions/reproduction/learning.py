@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.counts import SHORT_NAMES
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import curve_over_seeds, curves_figure
 from ethbrake_marl.extensions.report.style import TITLES
@@ -24,10 +25,13 @@ from ethbrake_marl.extensions.reproduction.verdicts import VERDICT_TOLERANCE, Cl
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.training.training import Training
+from ethbrake_marl.worlds.scenario import Scenario
 
 RANDOM, HIGH, LOW, STOPPED, DENSE = "random", "high", "low", "stopped", "dense"
 STATUS = "run.json"  # file with the status of a run
-FEWEST_EVALUATIONS = 6  # of a stopped training that is shown
+FEWEST_ROWS = 6  # with a return, and with a harm, of a stopped training that is shown
+FEWEST_RETURNS = 3  # that all stopped trainings of a plan share
 
 
 class TrainingPlan(NamedTuple):
@@ -67,7 +71,9 @@ def is_finished(run: Path) -> bool:
 def is_stopped(run: Path) -> bool:
     """Whether Ctrl-C stopped the run, after enough measurements for a learning curve."""
     status = read_status(run)
-    return status.get("status") == "interrupted" and len(status["evaluations"]) >= FEWEST_EVALUATIONS
+    if status.get("status") != "interrupted" or not status.get("evaluations"):
+        return False
+    return min(len(column(run, name)) for name in (RETURN, HARM)) >= FEWEST_ROWS
 
 
 def read_status(run: Path) -> dict[str, Any]:
@@ -77,13 +83,15 @@ def read_status(run: Path) -> dict[str, Any]:
 def trained_runs(folder: Path, group: str) -> dict[TrainingPlan, list[Path]]:
     """Trainings of a group, such as ``RANDOM``, that ``folder`` has: plan -> one folder of a run for each seed.
 
-    A plan has the finished trainings or, if none is finished, the stopped ones. It is left out if it has neither.
+    A plan has the finished trainings or, if none is finished, the stopped ones. It is left out if it has neither, or
+    if its stopped ones share too few steps for learning curves.
     """
     trained = {}
     for plan in TRAINING_GROUPS[group]:
         runs = runs_of(folder, group, plan)
-        if counted := [*filter(is_finished, runs)] or [*filter(is_stopped, runs)]:
-            trained[plan] = counted
+        finished, stopped = [*filter(is_finished, runs)], [*filter(is_stopped, runs)]
+        if finished or (stopped and len(shared_curves(stopped)[0][0]) >= FEWEST_RETURNS):
+            trained[plan] = finished or stopped
     return trained
 
 
@@ -112,15 +120,44 @@ def _train(plan: TrainingPlan, run: Path, seed: int, settings: ReproductionSetti
     if (run / STATUS).is_file():
         result = eb.resume(run, on_progress=settings.tell)
     else:
-        scenario, recipe = eb.load_scenario(plan.scenario), eb.load_recipe(plan.recipe)
-        if plan.mapped:
-            scenario = scenario.replace(physics="paper-map")
-        reward = {**recipe.reward.model_dump(mode="json"), "harm_count": SHORT_NAMES["paper"]}
-        if plan.terminal is not None:
-            reward["terminal"] = plan.terminal
-        recipe = recipe.replace(reward=reward)
-        result = eb.train(recipe, scenario, run, seed=seed, steps=plan.decisions, on_progress=settings.tell)
+        training = planned_training(plan, seed)
+        result = eb.train(training.recipe, training.scenario, run, on_progress=settings.tell)
     return result.status == "finished"
+
+
+def planned_training(plan: TrainingPlan, seed: int) -> Training:
+    import ethbrake_marl as eb
+
+    scenario, recipe = eb.load_scenario(plan.scenario), eb.load_recipe(plan.recipe)
+    if plan.mapped:
+        scenario = scenario.replace(physics="paper-map")
+    reward = {**recipe.reward.model_dump(mode="json"), "harm_count": SHORT_NAMES["paper"]}
+    if plan.terminal is not None:
+        reward["terminal"] = plan.terminal
+    return Training.of(recipe, scenario, reward=reward, seed=seed, total_steps=plan.decisions or recipe.total_steps)
+
+
+def check_runs(folder: Path) -> None:
+    """Raise ``InvalidInput`` if a training in ``folder`` has another scenario or recipe than its plan.
+
+    It may be of an earlier version.
+    """
+    plans = [(group, plan) for group in TRAINING_GROUPS for plan in TRAINING_GROUPS[group]]
+    seeds = [(plan, seed, run) for group, plan in plans for seed, run in enumerate(runs_of(folder, group, plan))]
+    for plan, seed, run in seeds:
+        if (run / STATUS).is_file():
+            file, right = run / "config.json", planned_training(plan, seed).content()
+            config = read_object(file)
+            try:
+                content = Training.of(config["recipe"], Scenario(**config["scenario"])).content()
+            except (KeyError, TypeError, InvalidInput) as error:
+                raise InvalidInput(f"{file}: does not describe a training ({error})") from None
+            others = [key for part in right for key in right[part] if content[part].get(key) != right[part][key]]
+            if content != right:
+                raise InvalidInput(
+                    f"{file}: has other values of {', '.join(others)} than the plan, {plan.recipe} on {plan.scenario};"
+                    f" delete the folder {run}, or use another --output"
+                )
 
 
 def unconverged_policy(folder: Path) -> str:
@@ -240,14 +277,21 @@ def column(run: Path, name: str) -> dict[float, float]:
     return {float(row["steps"]): float(row[name]) for row in rows if row.get(name)}
 
 
-def course_of(runs: Sequence[Path], planned_seeds: int) -> Course:
+def shared_curves(runs: Sequence[Path]) -> list[list[dict[float, float]]]:
+    """Returns, and harms, of each run at the steps that all runs have, until the last step with a harm."""
     curves = [[column(run, name) for run in runs] for name in (RETURN, HARM)]
     shared = [sorted(set.intersection(*map(set, of_seeds))) for of_seeds in curves]
-    last, seconds = shared[1][-1], [read_object(run / STATUS)["evaluations"][-1]["cpu_s"] for run in runs]
-    returns, harm = (
-        [{100.0 * k / last: curve[k] for k in steps if k <= last} for curve in of_seeds]
+    last = max(shared[1], default=0.0)
+    return [
+        [{k: curve[k] for k in steps if k <= last} for curve in of_seeds]
         for of_seeds, steps in zip(curves, shared, strict=True)
-    )
+    ]
+
+
+def course_of(runs: Sequence[Path], planned_seeds: int) -> Course:
+    curves = shared_curves(runs)
+    last, seconds = max(curves[1][0]), [read_object(run / STATUS)["evaluations"][-1]["cpu_s"] for run in runs]
+    returns, harm = ([{100.0 * k / last: curve[k] for k in curve} for curve in of_seeds] for of_seeds in curves)
     planned_decisions = read_object(runs[0] / "config.json")["recipe"]["total_steps"]
     return Course(returns, harm, last, sum(seconds) / len(seconds), planned_decisions, planned_seeds)
 

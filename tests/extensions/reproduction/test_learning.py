@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.reproduction import learning
+from ethbrake_marl.extensions.reproduction import items, learning
 from ethbrake_marl.extensions.reproduction.learning import DENSE, HIGH, LOW, RANDOM, STOPPED, Course, TrainingPlan
 from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.tables import process_sheet
 from ethbrake_marl.extensions.reproduction.trajectories import all_records
 from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less
 from ethbrake_marl.files.sheet import Estimate
+from tests.refused import refused
 
 pytest.importorskip("torch")
 
@@ -152,21 +153,72 @@ def test_trainings__that_are_finished_count_and_else_those_that_are_stopped(tmp_
     plant(first, 1.0)
     plant(second, 2.0, "interrupted")
     stopped, shorter, begun = learning.runs_of(tmp_path, LOW, sac)
-    plant(stopped, 3.0, "interrupted", rows=8, planned=5_000)
-    plant(shorter, 4.0, "interrupted", rows=7, planned=5_000)
+    plant(stopped, 3.0, "interrupted", rows=16, planned=10_000)
+    plant(shorter, 4.0, "interrupted", rows=13, planned=10_000)
     plant(begun, 9.0, "running")
     assert learning.trained_runs(tmp_path, LOW) == {ppo: [first], sac: [stopped, shorter]}
     assert learning.seconds_left(tmp_path, [LOW]) == 2 * 210.0 + 3 * 240.0
     courses = learning.courses_of(settings, LOW)
     assert courses["PPO"].length.startswith("1 of 3 seeds, 2,000 decisions, 1 CPU-s")
-    assert courses["SAC"].length.startswith("2 of 3 seeds, 3,000 of 5,000 decisions, 4 CPU-s")
-    assert courses["SAC"].last_harm.tolist() == [1.0, 2.0] and courses["SAC"].values.shape == (2, 6)
+    assert courses["SAC"].length.startswith("2 of 3 seeds, 6,000 of 10,000 decisions, 4 CPU-s")
+    assert courses["SAC"].last_harm.tolist() == [-5.0, -4.0] and courses["SAC"].values.shape == (2, 12)
     (begun / "run.json").write_text('{"status": "interrupted", "evaluations": []}')  # stopped at once
     assert len(learning.trained_runs(tmp_path, LOW)[sac]) == 2
     plant(learning.runs_of(tmp_path, DENSE, *learning.TRAINING_GROUPS[DENSE])[0], 1.0)
     made = learning.reproduce_curves(LOW, settings)  # no claim that compares delays
     assert verdicts_of(made.claims) == {"sparse": "not converged", "terminal": "not converged"}
     assert [row[0] for row in made.sheets[0].rows] == ["PPO", "SAC"]
+
+
+def progress(*steps: int, returns: int = 12) -> str:
+    """Rows at ``steps`` with a harm in every second row; only the first rows have a return."""
+    cells = [f"{step},{-k if k < returns else ''},{9 - k if k % 2 else ''}" for k, step in enumerate(steps)]
+    return "\n".join([f"steps,{learning.RETURN},{learning.HARM}", *cells])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "counted"),
+    [
+        ("run.json", '{"status": "interrupted"}', 1),
+        ("progress.csv", progress(*range(500, 6500, 500), returns=0), 1),
+        ("progress.csv", progress(*range(500, 6500, 500), returns=2), 1),
+        ("progress.csv", progress(*range(500, 2500, 500)), 1),
+        ("progress.csv", progress(*range(507, 6507, 500)), 0),  # the seeds share no step
+        ("progress.csv", progress(500, 1000, *range(1507, 6507, 500)), 0),  # they share two returns
+    ],
+)
+def test_stopped_trainings__without_a_curve_are_left_out(name: str, text: str, counted: int, tmp_path: Path) -> None:
+    _, sac = learning.TRAINING_GROUPS[HIGH]
+    first, second, _ = learning.runs_of(tmp_path, HIGH, sac)
+    for run in (first, second):
+        plant(run, 1.0, "interrupted", rows=12)
+    (second / name).write_text(text)
+    assert learning.trained_runs(tmp_path, HIGH) == ({sac: [first]} if counted else {})
+    assert len(learning.reproduce_curves(HIGH, ReproductionSettings(tmp_path)).figures) == counted
+
+
+def test_trainings__of_another_plan_are_refused(tmp_path: Path) -> None:
+    settings, (ppo, _) = ReproductionSettings(tmp_path), learning.TRAINING_GROUPS[HIGH]
+    run = learning.runs_of(tmp_path, HIGH, ppo)[1]
+    plant(run, 1.0)
+    file, right = run / "config.json", learning.planned_training(ppo, 1)
+    file.write_text(json.dumps(right.config()))
+    learning.check_runs(tmp_path)
+    earlier = right.config() | {"versions": {"ethbrake-marl": "1.0.0"}}
+    earlier["recipe"] |= {"title": "Another title"}
+    file.write_text(json.dumps(earlier))
+    learning.check_runs(tmp_path)
+    for other, message in (
+        (learning.planned_training(ppo, 0), "has other values of seed than the plan, ppo-paper on paper-delay-high"),
+        (learning.planned_training(learning.TRAINING_GROUPS[LOW][0], 1), "has other values of "),
+    ):
+        file.write_text(json.dumps(other.config()))
+        with refused(f"{file}: {message}"):
+            items.reproduce(settings, [], "a machine")
+    for damaged in ({}, {"recipe": {}, "scenario": {}}, {"recipe": right.config()["recipe"], "scenario": 7}):
+        file.write_text(json.dumps(damaged))
+        with refused(f"{file}: does not describe a training ("):
+            learning.check_runs(tmp_path)
 
 
 def test_plans__are_of_the_papers_map_and_shipped_recipes() -> None:
