@@ -86,7 +86,9 @@ class Policy:
             raise InvalidInput(f"policy: {reason}") from None
 
     def with_range(self, training_range: TrainingRange | None) -> Self:
-        manifest = self.manifest.model_copy(update={"training_range": training_range})
+        """Policy with this range. Raises pydantic's ``ValidationError`` if the range does not fit."""
+        content = {**self.manifest.model_dump(), "training_range": training_range and training_range.model_dump()}
+        manifest = Manifest.model_validate(content)
         sha256 = _manifest_sha256(manifest)
         return replace(self, manifest=manifest.model_copy(update={"manifest_sha256": sha256}))
 

@@ -1,5 +1,6 @@
 """The scripts of docs/studies, and pages that tell what the code does or what was measured: paper, cooperation, ..."""
 
+import csv
 import dataclasses
 import json
 import subprocess
@@ -15,6 +16,7 @@ from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.training import Training
+from tests.docs.printed import rows
 from tests.docs.site import DOCS, load
 
 drawings = load("../drawings")
@@ -112,6 +114,35 @@ def test_competence__has_a_best_known_cost_of_every_line() -> None:
     best = json.loads(competence.BEST.read_text("utf-8"))
     assert best.keys() == {*competence.shipped(), *dict(competence.places())}
     assert len(best) > 80 and all(cost >= 0.0 for cost in best.values())
+
+
+NO_NUMBERS = ("line", "learners")  # columns of lines.csv
+
+
+def test_page_of_universal__has_the_numbers_of_the_lines() -> None:
+    competence = load("../studies/competence")
+    table = list(csv.DictReader(competence.TABLE.read_text("utf-8").splitlines()))
+    costs = {row["line"]: {key: float(cell) for key, cell in row.items() if key not in NO_NUMBERS} for row in table}
+    groups: dict[str, list[str]] = {"one learner": [], "several learners": [], "the channel hides values": []}
+    for row in table:
+        known = "several learners" if " " in row["learners"] else "one learner"
+        groups["the channel hides values" if float(row["hidden"]) else known].append(row["line"])
+    recomputed = []
+    for group, names in groups.items():
+        for agent in competence.LEARNED:
+            better = {name: min(costs[name][rule] for rule in competence.rules_of(costs[name])) for name in names}
+            worse = sum(competence.is_worse(costs[name][agent], better[name]) for name in names)
+            searched = [name for name in names if costs[name]["best_known"] >= competence.NO_COST]
+            ratios = {name: costs[name][agent] / costs[name]["best_known"] for name in searched}
+            worst = max(ratios, key=lambda name: ratios[name])
+            titles = [group, str(len(names))] if agent == competence.POLICY else ["", ""]
+            numbers = [str(worse), f"{np.median([*ratios.values()]):.2f}", f"{ratios[worst]:.2f} (`{worst}`)"]
+            recomputed.append([*titles, f"`{agent}`", *numbers])
+    assert rows("reference/policies", "## `universal` in every line")[1:] == recomputed
+    agents_numbers = {tuple(row[key] for key in row if key != "best_known") for row in costs.values()}
+    page = " ".join((DOCS / "reference" / "policies.md").read_text("utf-8").split())
+    assert f"{len(costs)} rows, of which {len(agents_numbers)} differ" in page
+    assert f"In each of [{len(agents_numbers)} lines](" in (DOCS.parent / "README.md").read_text("utf-8")
 
 
 def test_universal__was_trained_by_its_recipe_on_its_lines() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from ethbrake_marl.episode.features import FEATURES, register_feature
 from ethbrake_marl.episode.state import State
@@ -69,7 +72,9 @@ def test_policy__keeps_its_range_in_its_file(tmp_path: Path, monkeypatch: pytest
     ],
 )
 def test_bad_range__is_refused(change: dict[str, Any], text: str, tmp_path: Path) -> None:
-    policy = make_policy()
-    policy.with_range(TrainingRange.model_construct(**change)).save(tmp_path / "a")
+    policy, bad = make_policy(), TrainingRange.model_construct(**change)
+    with pytest.raises(ValidationError, match=re.escape(text.removeprefix("training_range: "))):
+        policy.with_range(bad)
+    replace(policy, manifest=policy.manifest.model_copy(update={"training_range": bad})).save(tmp_path / "a")
     with refused(text, CorruptBundle):
         load_policy(tmp_path / "a")
