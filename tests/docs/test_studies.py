@@ -143,6 +143,8 @@ def test_page_of_universal__has_the_numbers_of_the_lines() -> None:
     page = " ".join((DOCS / "reference" / "policies.md").read_text("utf-8").split())
     assert f"{len(costs)} rows, of which {len(agents_numbers)} differ" in page
     assert f"In each of [{len(agents_numbers)} lines](" in (DOCS.parent / "README.md").read_text("utf-8")
+    rivals = {name: min(row[rule] for rule in competence.rules_of(row)) for name, row in costs.items()}
+    assert all(row[competence.POLICY] <= 1.01 * rivals[name] for name, row in costs.items())
 
 
 def test_universal__was_trained_by_its_recipe_on_its_lines() -> None:
