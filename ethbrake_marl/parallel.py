@@ -71,7 +71,7 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
                 "a worker process was killed, perhaps because memory ran out; use fewer processes at once (--jobs)"
             ) from None
         finally:
-            with warnings.catch_warnings(action="ignore"):  # warnings about calls that are cancelled
+            with warnings.catch_warnings(action="ignore"), _silent_threads():  # warnings about calls that are cancelled
                 getattr(results, "close", list)()
 
 
@@ -90,6 +90,17 @@ def _blocked_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _silent_threads() -> Iterator[None]:
+    """Context in which an exception in a thread prints nothing: joblib's thread may fill a queue that is closed."""
+    before = threading.excepthook
+    threading.excepthook = lambda arguments: None
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 def _pickle_call(call: Call) -> bytes:

@@ -137,7 +137,7 @@ _USUAL = (
 _SUBSTITUTES = (
     Rule(
         "time_gaps_s", "s", "pair", 60.0, True, 0,
-        "gap of each pair divided by the speed of its rear vehicle, front to rear", "[1, 1]",
+        "gap of each pair divided by the speed of its rear vehicle, front to rear", "1",
     ),
     Rule(
         "line_speed_mps", "mps", "world", 200.0, False, 7, "speed that all vehicles share at the alert", "20", block=1

@@ -54,7 +54,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "line 15: gaps_km: unknown key; did you mean gaps_m (metres)?": lambda: given(gaps_m=None, gaps_km="0.007"),
     "line 15: restituton: unknown key; did you mean restitution?": lambda: given(restitution=None, restituton="0.1"),
     "line 15: zzz: unknown key": lambda: given(restitution=None, zzz="0.1"),
-    "bad.yaml: gaps_m: missing; write, for instance, gaps_m: [7, 7], or time_gaps_s: [1": lambda: given(gaps_m=None),
+    "bad.yaml: gaps_m: missing; write, for instance, gaps_m: 7, or time_gaps_s: 1": lambda: given(gaps_m=None),
     "bad.yaml: name: missing; write, for instance, name: my-scenario": lambda: given(name=None),
     "line 5: gaps_m = -1: must be finite and in [0, 10000] m (metres)": lambda: given(gaps_m="-1"),
     "line 5: gaps_m: has 3 entries; must have 2, one per pair, or be a single": lambda: given(gaps_m="[7, 7, 7]"),
@@ -146,7 +146,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "line 14: early_impacts = refuse: must be keep or reject": lambda: given(early_impacts="refuse"),
     "must be 1 to 64 lower case letters, digits, - and _, beginning with a letter": lambda: given(name="Bad Name"),
-    "bad.yaml: speeds_mps: missing; write, for instance, speeds_mps: [20": lambda: given(speeds_mps=None, gaps_m="7"),
+    "bad.yaml: speeds_mps: missing; write, for instance, speeds_mps: 20": lambda: given(speeds_mps=None, gaps_m="7"),
     "line 15: time_gaps_s = 1: give either gaps_m or time_gaps_s, not both": lambda: given(
         gaps_m="7", time_gaps_s="1", speeds_mps="20"
     ),
