@@ -30,7 +30,7 @@ from tests.programmes import ROOT, Cases, Given, Told, watched
 LIMIT_S = 900.0  # no case begins later
 PAGE, HEADING = "docs/libraries.md", "## How fast\n"
 UNTRIED = {  # file -> what it says until this programme has run on a GPU
-    "README.md": "; experimental: not run on a GPU since a prototype in November 2026",
+    "README.md": " It is experimental: only a prototype has run on a GPU, in November 2026.",
     PAGE: "Experimental: not run on a GPU since a prototype in November 2026.\n\n",
 }
 OPTIONS = {
