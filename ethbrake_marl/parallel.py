@@ -71,7 +71,7 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
                 "a worker process was killed, perhaps because memory ran out; use fewer processes at once (--jobs)"
             ) from None
         finally:
-            with warnings.catch_warnings(action="ignore"), _silent_threads():  # warnings about calls that are cancelled
+            with warnings.catch_warnings(action="ignore"), _silent_joblib():  # warnings about calls that are cancelled
                 getattr(results, "close", list)()
 
 
@@ -93,10 +93,15 @@ def _blocked_interrupt() -> Iterator[None]:
 
 
 @contextmanager
-def _silent_threads() -> Iterator[None]:
-    """Context in which an exception in a thread prints nothing: joblib's thread may fill a queue that is closed."""
+def _silent_joblib() -> Iterator[None]:
+    """Context in which an exception in joblib's thread prints nothing: it may fill a queue that is closed."""
     before = threading.excepthook
-    threading.excepthook = lambda arguments: None
+
+    def tell(arguments: threading.ExceptHookArgs) -> None:
+        if arguments.thread is None or arguments.thread.name != "ExecutorManagerThread":
+            before(arguments)
+
+    threading.excepthook = tell
     try:
         yield
     finally:

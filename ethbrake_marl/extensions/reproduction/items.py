@@ -24,7 +24,7 @@ from ethbrake_marl.extensions.reproduction.learning import (
     LOW,
     RANDOM,
     STOPPED,
-    check_runs,
+    check_trainings,
     reproduce_curves,
     seconds_left,
     train_groups,
@@ -141,7 +141,7 @@ def reproduce(
     """
     folder, results = settings.folder, {}
     check_folder(folder, (RESULTS_FILE,), force=force)
-    check_runs(folder)
+    check_trainings(folder)
     if not train_groups(settings, groups_of(settings, items)):
         return None
     for number, item in enumerate(items):

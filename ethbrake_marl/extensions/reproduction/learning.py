@@ -137,7 +137,7 @@ def planned_training(plan: TrainingPlan, seed: int) -> Training:
     return Training.of(recipe, scenario, reward=reward, seed=seed, total_steps=plan.decisions or recipe.total_steps)
 
 
-def check_runs(folder: Path) -> None:
+def check_trainings(folder: Path) -> None:
     """Raise ``InvalidInput`` if a training in ``folder`` has another scenario or recipe than its plan.
 
     It may be of an earlier version.

@@ -203,11 +203,11 @@ def test_trainings__of_another_plan_are_refused(tmp_path: Path) -> None:
     plant(run, 1.0)
     file, right = run / "config.json", learning.planned_training(ppo, 1)
     file.write_text(json.dumps(right.config()))
-    learning.check_runs(tmp_path)
+    learning.check_trainings(tmp_path)
     earlier = right.config() | {"versions": {"ethbrake-marl": "1.0.0"}}
     earlier["recipe"] |= {"title": "Another title"}
     file.write_text(json.dumps(earlier))
-    learning.check_runs(tmp_path)
+    learning.check_trainings(tmp_path)
     for other, message in (
         (learning.planned_training(ppo, 0), "has other values of seed than the plan, ppo-paper on paper-delay-high"),
         (learning.planned_training(learning.TRAINING_GROUPS[LOW][0], 1), "has other values of "),
@@ -218,7 +218,7 @@ def test_trainings__of_another_plan_are_refused(tmp_path: Path) -> None:
     for damaged in ({}, {"recipe": {}, "scenario": {}}, {"recipe": right.config()["recipe"], "scenario": 7}):
         file.write_text(json.dumps(damaged))
         with refused(f"{file}: does not describe a training ("):
-            learning.check_runs(tmp_path)
+            learning.check_trainings(tmp_path)
 
 
 def test_plans__are_of_the_papers_map_and_shipped_recipes() -> None:
