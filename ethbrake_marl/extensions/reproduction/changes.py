@@ -8,8 +8,8 @@ import numpy as np
 
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST
 from ethbrake_marl.extensions.reproduction.curves import DISTANCE, DISTANCE_WORLDS, by_distance, harm_of_strategies
-from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
-from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, NON_E, ROUNDING, RandomOutcome
+from ethbrake_marl.extensions.reproduction.made import WHO_DRIVES, Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, NON_E, ROUNDING, SHIPPED_SPECS, RandomOutcome
 from ethbrake_marl.extensions.reproduction.readings import STATED
 from ethbrake_marl.extensions.reproduction.strategies import (
     COUPLED,
@@ -27,9 +27,9 @@ EARLY_S = 0.2  # time at which Vehicle 2 acts, at which the row of Non-E comes o
 
 def reproduce_changes(settings: ReproductionSettings) -> Made:
     """Table of claims that differ, and of the one change that makes each true. People write both; numbers are ours."""
-    episodes, policies = settings.episodes, settings.policies
+    episodes = settings.episodes
     readings = STATED, STATED._replace(acts_s=EARLY_S)
-    stated, early = (strategies(reading, episodes, policies) for reading in readings)
+    stated, early = (strategies(reading, episodes, SHIPPED_SPECS) for reading in readings)
     distance, worlds = STATED._replace(base=DISTANCE), min(DISTANCE_WORLDS, episodes)
     (lines, shortest), *_ = by_distance(distance, worlds, harm_of_strategies(distance, worlds, {})).values()
     collisions = [row.episodes - row.collisions for row in HYBRID_TEST]
@@ -39,17 +39,17 @@ def reproduce_changes(settings: ReproductionSettings) -> Made:
             f"hybrid with {name} "
             + " -> ".join(f"{stated[f'Hybrid {name}{ending}']['first'].mean():.2f}" for ending in bounds)
             + f", {name} alone {stated[name]['first'].mean():.2f}"
-            for name in policies
+            for name in SHIPPED_SPECS
         ),
         "bound": "; ".join(
             f"hybrid with {name} above it in "
             + " -> ".join(f"{above_bound(stated[f'Hybrid {name}{ending}']):,}" for ending in bounds)
-            for name in policies
+            for name in SHIPPED_SPECS
         ),
         "lower": "; ".join(
             f"hybrid with {name} not the lower in "
             + " -> ".join(f"{not_lower(stated, name, ending, bounds[ending]):,}" for ending in bounds)
-            for name in policies
+            for name in SHIPPED_SPECS
         ),
         "overall": " -> ".join(
             f"{stated[name][PREDICTED].mean():.2f} for {stated[name]['first'].mean():.2f}" for name in bounds.values()
@@ -67,9 +67,7 @@ def reproduce_changes(settings: ReproductionSettings) -> Made:
     }
     rows = [(row["claim"], row["change"], numbers[row["result"]]) for row in paper_texts()["changes"]]
     note = "As stated -> with the change. Mean harm in m²/s²; shares and counts are of worlds."
-    return Made(
-        sheets=[Sheet("Claims and changes", ("Claim", "Change", "Numbers"), rows, note)], notes=[settings.who_drives]
-    )
+    return Made(sheets=[Sheet("Claims and changes", ("Claim", "Change", "Numbers"), rows, note)], notes=[WHO_DRIVES])
 
 
 def not_lower(outcomes: Mapping[str, RandomOutcome], policy: str, ending: str, baseline: str) -> int:

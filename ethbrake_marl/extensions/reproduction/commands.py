@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, example
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.registry import Part
 
@@ -30,9 +29,6 @@ def reproduce_command(
             "--full", help="Also train by the paper's own process, which takes hours; --cost prints how many."
         ),
     ] = False,
-    policies: Annotated[
-        str, typer.Option(metavar="NAME=AGENT,...", help="Agents in place of the shipped policies: ppo=policy@RUN.")
-    ] = "",
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")] = Path("runs/reproduction"),
     episodes: Annotated[
         int,
@@ -64,42 +60,17 @@ def reproduce_command(
             sheet = Sheet("", ("Item", "Label in the paper", "What"), rows)
             out.result(sheet.json(), sheet)
             return
-        settings = ReproductionSettings(output, full, episodes, out.show_progress, chosen_policies(policies))
+        settings = ReproductionSettings(output, full, episodes, out.show_progress)
         out.note(items.cost(settings, chosen))
         if cost:
             return
         results = items.reproduce(settings, chosen, this_machine(), force=out.force)
         if results is None:
             out.interrupted(f"interrupted; {AFTER_STOPPED_REPRODUCTION}")
-        out.result(items.plain_results(results, settings), items.overview(results, settings), in_file=True)
+        out.result(items.plain_results(results), items.overview(results), in_file=True)
         if not full:
             out.note(items.QUICK_NOTE)
         out.note(f"page: {output / items.RESULTS_FILE}")
-
-
-def chosen_policies(text: str) -> dict[str, str]:
-    """Agents in the place of the paper's policies: ``PPO`` and ``SAC`` -> agent name.
-
-    ``text``: replacements of the shipped policies, such as ``ppo=policy@RUN``. Raises ``InvalidInput`` for any other
-    text, and for an agent that cannot drive in the random test.
-    """
-    from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS, WORLD_FIELDS, drive_all
-    from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED
-
-    replaced = dict[str, str]()
-    for part in filter(None, text.split(",")):
-        name, _, spec = part.partition("=")
-        if name.upper() not in SHIPPED_SPECS or name.upper() in replaced or not spec:
-            raise InvalidInput(
-                f"--policies {text}: {part!r}: must be ppo=AGENT or sac=AGENT, each once, for instance ppo=policy@RUN"
-            )
-        try:  # so that what cannot drive is refused before a training
-            for reading in (STATED, NEAREST):
-                drive_all(reading.only(*WORLD_FIELDS), spec, "first", 2)
-        except InvalidInput as error:
-            raise InvalidInput(f"--policies {part}: {error}") from None
-        replaced[name.upper()] = spec
-    return {**SHIPPED_SPECS, **replaced}
 
 
 REPRODUCE = Part(reproduce_command, epilog=example("reproduce random-table harm-distance --output runs/paper"))

@@ -5,7 +5,7 @@ A *reading* is one interpretation of the paper's text (``readings``).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -14,10 +14,11 @@ from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import curves_figure
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.learning import RANDOM, courses_of, judge_trained, unconverged_policy
-from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.made import WHO_DRIVES, DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,
     NON_E,
+    SHIPPED_SPECS,
     WORLD_FIELDS,
     avoided_text,
     brake,
@@ -133,39 +134,39 @@ def distances(settings: ReproductionSettings, policies: Mapping[str, str]) -> di
 
 def reproduce_distance(settings: ReproductionSettings) -> Made:
     """Fig. 4: harm of each strategy over the sum of both gaps at the alert, and the paper's statements about it."""
-    readings = distances(settings, settings.policies)
+    readings = distances(settings, SHIPPED_SPECS)
     groups = readings["as stated"]
-    stated, nearest = (statements(lines, settings.policies) for lines in readings.values())
+    stated, nearest = (statements(lines) for lines in readings.values())
     claims = [judge(name, parts, nearest[name]) for name, parts in stated.items()]
     distance_reading, episodes = STATED._replace(base=DISTANCE), min(DISTANCE_WORLDS, settings.episodes)
-    claims += [constant_claim(groups, settings.policies), capacity_claim(distance_reading, episodes)]
-    claims += [avoidance_by_distance(groups, policy) for policy in settings.policies]
+    claims += [constant_claim(groups), capacity_claim(distance_reading, episodes)]
+    claims += [avoidance_by_distance(groups, policy) for policy in SHIPPED_SPECS]
     if lines := process_lines(distance_reading, episodes, settings):
         readings[PAPERS] = by_distance(distance_reading, episodes, lines)
         claims += process_claims(settings, readings[PAPERS], [E_V2X_BM])
-    result = over_distance("harm-distance", readings, [NON_E, E_V2X_BM, COUPLED, *settings.policies, EXPECTED, PROVEN])
-    return result._replace(claims=claims, notes=[settings.who_drives])
+    result = over_distance("harm-distance", readings, [NON_E, E_V2X_BM, COUPLED, *SHIPPED_SPECS, EXPECTED, PROVEN])
+    return result._replace(claims=claims, notes=[WHO_DRIVES])
 
 
-def statements(groups: Groups, policies: Iterable[str]) -> dict[str, list[Less]]:
+def statements(groups: Groups) -> dict[str, list[Less]]:
     lines, shortest = next(iter(groups.values()))
     half = 0.5 * lines[NON_E][shortest]
     return {
-        "Non-E harms most": [part for name in (E_V2X_BM, *policies) for part in less_in_each(groups, name, NON_E)],
+        "Non-E harms most": [part for name in (E_V2X_BM, *SHIPPED_SPECS) for part in less_in_each(groups, name, NON_E)],
         "Non-E grows": growth_between_groups(groups, NON_E),
         "E-V2X-BM harms less": less_in_each(groups, E_V2X_BM, NON_E),
         "E-V2X-BM at the shortest distance": [
             Less.of_worlds("half of Non-E minus E-V2X-BM", half, lines[E_V2X_BM][shortest])
         ],
-        "learning harms less": [part for policy in policies for part in less_in_each(groups, policy, E_V2X_BM)],
+        "learning harms less": [part for policy in SHIPPED_SPECS for part in less_in_each(groups, policy, E_V2X_BM)],
     }
 
 
-def constant_claim(groups: Groups, policies: Iterable[str]) -> Claim:
+def constant_claim(groups: Groups) -> Claim:
     """Verdict: at the shortest distance even the best constant deceleration does more harm than learned braking."""
     (distance, (lines, rows)), *_ = groups.items()
-    harm = {name: lines[name][rows] for name in (E_V2X_BM, COUPLED, *policies, PROVEN)}
-    parts = [Less.of_worlds(f"{name} minus {COUPLED}", harm[name], harm[COUPLED]) for name in policies]
+    harm = {name: lines[name][rows] for name in (E_V2X_BM, COUPLED, *SHIPPED_SPECS, PROVEN)}
+    parts = [Less.of_worlds(f"{name} minus {COUPLED}", harm[name], harm[COUPLED]) for name in SHIPPED_SPECS]
     text = ", ".join(f"{name} {values.mean():.2f}" for name, values in harm.items())
     return judge("constant deceleration", parts, numbers=f"{distance}: {text}")
 
@@ -232,30 +233,30 @@ def reproduce_delays(settings: ReproductionSettings) -> Made:
         reading = STATED._replace(base=f"paper-delay-{delay}", others=PAPER_WORLD)
         _, middle, rear = open_reading(reading.only(*WORLD_FIELDS), 1)[2].latency_s[0]
         name = f"{delay} ({middle:g}, {rear:g} s)"
-        groups[name] = harm_of_strategies(reading, 1, settings.policies), only_world
+        groups[name] = harm_of_strategies(reading, 1, SHIPPED_SPECS), only_world
         trained[name] = process_lines(reading, 1, settings), only_world
     parts = [
         part
-        for policy in settings.policies
+        for policy in SHIPPED_SPECS
         for baseline in (NON_E, E_V2X_BM, COUPLED)
         for part in less_in_each(groups, policy, baseline)
     ]
     readings = {"as stated": groups} | ({PAPERS: trained} if all(lines for lines, _ in trained.values()) else {})
-    claims = [judge("learning harms least", parts), robustness_claim(groups, settings.policies), room_claim(settings)]
+    claims = [judge("learning harms least", parts), robustness_claim(groups), room_claim(settings)]
     if PAPERS in readings:
         claims += process_claims(settings, trained, [NON_E, E_V2X_BM])
-    legend = [NON_E, E_V2X_BM, COUPLED, *settings.policies, EXPECTED, PROVEN]
+    legend = [NON_E, E_V2X_BM, COUPLED, *SHIPPED_SPECS, EXPECTED, PROVEN]
     result = show_harm("harm-delays", "Gaps of 7 m, speeds of 20, 18 and 20 m/s", readings, legend, "Delay")
-    return result._replace(claims=claims, notes=[f"One world: no intervals. {settings.who_drives}"])
+    return result._replace(claims=claims, notes=[f"One world: no intervals. {WHO_DRIVES}"])
 
 
-def robustness_claim(groups: Groups, policies: Iterable[str]) -> Claim:
+def robustness_claim(groups: Groups) -> Claim:
     """Verdict: from the low to the high delay, the harm of a policy grows less than that of other strategies."""
     (low, _), *_, (high, _) = groups.values()
-    growth = {name: high[name] - low[name] for name in (NON_E, E_V2X_BM, COUPLED, *policies)}
+    growth = {name: high[name] - low[name] for name in (NON_E, E_V2X_BM, COUPLED, *SHIPPED_SPECS)}
     parts = [
         Less.of_worlds(f"{policy} minus {name}", growth[policy], growth[name])
-        for policy in policies
+        for policy in SHIPPED_SPECS
         for name in (NON_E, E_V2X_BM, COUPLED)
     ]
     return judge("robust", parts, numbers=", ".join(f"{name} {by.mean():+.2f}" for name, by in growth.items()))

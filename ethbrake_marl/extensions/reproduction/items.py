@@ -31,7 +31,6 @@ from ethbrake_marl.extensions.reproduction.learning import (
     trained_runs,
 )
 from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, DrawnFigure, Item, Made, ReproductionSettings
-from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS
 from ethbrake_marl.extensions.reproduction.register import reproduce_gaps
 from ethbrake_marl.extensions.reproduction.tables import reproduce_hybrid_table, reproduce_random_table
 from ethbrake_marl.extensions.reproduction.trajectories import reproduce_accelerations, reproduce_trajectories
@@ -148,7 +147,7 @@ def reproduce(
         settings.tell(Progress(f"items: {item.name}", number, len(items)))
         results[item] = result = item.make(settings)
         write_item(folder / item.name, result.sheets, result.figures)
-    write_item(folder, [overview(results, settings)])
+    write_item(folder, [overview(results)])
     today = datetime.now(UTC).date().isoformat()
     made_by = (
         f"`{command_line(settings, items)}` on {today} ({machine}; version {__version__}, physics {physics_digest()})"
@@ -161,11 +160,7 @@ def command_line(settings: ReproductionSettings, items: Sequence[Item]) -> str:
     names = [item.name for item in items] if len(items) < len(ITEMS) else []
     full = ["--full"] if settings.full else []
     limit = ["--episodes", str(settings.episodes)] if settings.episodes < PAPER_EPISODES else []
-    policy_list = ",".join(f"{name.lower()}={spec}" for name, spec in settings.policies.items())
-    policies = (
-        ["--policies", policy_list] if settings.policies != ReproductionSettings(settings.folder).policies else []
-    )
-    return shlex.join(["ethbrake", "reproduce", *names, *full, *limit, *policies])
+    return shlex.join(["ethbrake", "reproduce", *names, *full, *limit])
 
 
 def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[DrawnFigure] = ()) -> None:
@@ -190,13 +185,13 @@ def markdown(sheet: Sheet) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in (sheet.headings, rule, *rows))
 
 
-def plain_results(results: Mapping[Item, Made], settings: ReproductionSettings) -> list[dict[str, Any]]:
+def plain_results(results: Mapping[Item, Made]) -> list[dict[str, Any]]:
     return [
         {
             "name": item.name,
             "labels": list(item.labels),
             "title": item.title,
-            "claims": overview({item: result}, settings).json(),
+            "claims": overview({item: result}).json(),
             "tables": {sheet.title: sheet.json() for sheet in result.sheets},
             "notes": list(result.notes),
             "version": __version__,
@@ -206,16 +201,16 @@ def plain_results(results: Mapping[Item, Made], settings: ReproductionSettings) 
     ]
 
 
-def overview(results: Mapping[Item, Made], settings: ReproductionSettings) -> Sheet:
+def overview(results: Mapping[Item, Made]) -> Sheet:
     claims = {item.name: {claim.name: claim for claim in result.claims} for item, result in results.items()}
-    return sentences_sheet(claims, reasons=settings.policies == SHIPPED_SPECS)
+    return sentences_sheet(claims)
 
 
 def page(made_by: str, results: Mapping[Item, Made], settings: ReproductionSettings) -> str:
     """Page of all results as Markdown. ``made_by``: command, date, computer and versions."""
     lead = f"Numbers, statements and figures of {PAPER}, and ours. Made by {made_by}."
     parts = ["# The paper, reproduced", lead, *([] if settings.full else [QUICK_NOTE])]
-    table = [SENTENCES, paper_texts()["lead"], markdown(overview(results, settings))]
+    table = [SENTENCES, paper_texts()["lead"], markdown(overview(results))]
     if CHANGES not in results:
         parts += table
     for item, result in results.items():

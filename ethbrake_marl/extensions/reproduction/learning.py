@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,6 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 RANDOM, HIGH, LOW, STOPPED, DENSE = "random", "high", "low", "stopped", "dense"
 STATUS = "run.json"  # file with the status of a run
-FEWEST_ROWS = 6  # with a return, and with a harm, of a stopped training that is shown
-FEWEST_RETURNS = 3  # that all stopped trainings of a plan share
 
 
 class TrainingPlan(NamedTuple):
@@ -65,34 +63,16 @@ def runs_of(folder: Path, group: str, plan: TrainingPlan) -> list[Path]:
 
 
 def is_finished(run: Path) -> bool:
-    return read_status(run).get("status") == "finished"
-
-
-def is_stopped(run: Path) -> bool:
-    """Whether Ctrl-C stopped the run, after enough measurements for a learning curve."""
-    status = read_status(run)
-    if status.get("status") != "interrupted" or not status.get("evaluations"):
-        return False
-    return min(len(column(run, name)) for name in (RETURN, HARM)) >= FEWEST_ROWS
-
-
-def read_status(run: Path) -> dict[str, Any]:
-    return read_object(run / STATUS) if (run / STATUS).is_file() else {}
+    return (run / STATUS).is_file() and read_object(run / STATUS).get("status") == "finished"
 
 
 def trained_runs(folder: Path, group: str) -> dict[TrainingPlan, list[Path]]:
-    """Trainings of a group, such as ``RANDOM``, that ``folder`` has: plan -> one folder of a run for each seed.
+    """Finished trainings of a group, such as ``RANDOM``, in ``folder``: plan -> one folder of a run for each seed.
 
-    A plan has the finished trainings or, if none is finished, the stopped ones. It is left out if it has neither, or
-    if its stopped ones share too few steps for learning curves.
+    A plan without one is left out.
     """
-    trained = {}
-    for plan in TRAINING_GROUPS[group]:
-        runs = runs_of(folder, group, plan)
-        finished, stopped = [*filter(is_finished, runs)], [*filter(is_stopped, runs)]
-        if finished or (stopped and len(shared_curves(stopped)[0][0]) >= FEWEST_RETURNS):
-            trained[plan] = finished or stopped
-    return trained
+    trained = {plan: [*filter(is_finished, runs_of(folder, group, plan))] for plan in TRAINING_GROUPS[group]}
+    return {plan: runs for plan, runs in trained.items() if runs}
 
 
 def seconds_left(folder: Path, groups: Iterable[str]) -> float:
@@ -194,7 +174,6 @@ class Course(NamedTuple):
     harm: LearningCurves  # first-impact harm in a fixed list of worlds (m2/s2)
     decisions: float = 100.0  # of a training
     seconds: float = 0.0  # processor time of a training, mean over seeds
-    planned_decisions: float = 0.0
     planned_seeds: int = 1
 
     @property
@@ -225,12 +204,11 @@ class Course(NamedTuple):
 
     @property
     def is_converged(self) -> bool:
-        """Whether the training is complete, and the ``improvement`` at most 2 % of the mean ``rise``.
+        """Whether the ``improvement`` is at most 2 % of the mean ``rise``.
 
         The last quarter alone cannot show it: the learning rate falls, so every training is calm in the end.
         """
-        complete = self.decisions >= self.planned_decisions
-        return complete and self.improvement <= VERDICT_TOLERANCE * float(self.rise.mean())
+        return self.improvement <= VERDICT_TOLERANCE * float(self.rise.mean())
 
     @property
     def has_interval(self) -> bool:
@@ -240,9 +218,8 @@ class Course(NamedTuple):
     @property
     def length(self) -> str:
         """Number of seeds, length of a training and its convergence, in words."""
-        of = f" of {self.planned_decisions:,.0f}" if self.decisions < self.planned_decisions else ""
         return (
-            f"{len(self.returns)} of {self.planned_seeds} seeds, {self.decisions:,.0f}{of} decisions,"
+            f"{len(self.returns)} of {self.planned_seeds} seeds, {self.decisions:,.0f} decisions,"
             f" {self.seconds:,.0f} CPU-s, last third {self.improvement:+.2f} of {self.rise.mean():.1f}"
         )
 
@@ -277,23 +254,15 @@ def column(run: Path, name: str) -> dict[float, float]:
     return {float(row["steps"]): float(row[name]) for row in rows if row.get(name)}
 
 
-def shared_curves(runs: Sequence[Path]) -> list[list[dict[float, float]]]:
-    """Returns, and harms, of each run at the steps that all runs have, until the last step with a harm."""
-    curves = [[column(run, name) for run in runs] for name in (RETURN, HARM)]
-    shared = [sorted(set.intersection(*map(set, of_seeds))) for of_seeds in curves]
-    last = max(shared[1], default=0.0)
-    return [
-        [{k: curve[k] for k in steps if k <= last} for curve in of_seeds]
-        for of_seeds, steps in zip(curves, shared, strict=True)
-    ]
-
-
 def course_of(runs: Sequence[Path], planned_seeds: int) -> Course:
-    curves = shared_curves(runs)
-    last, seconds = max(curves[1][0]), [read_object(run / STATUS)["evaluations"][-1]["cpu_s"] for run in runs]
-    returns, harm = ([{100.0 * k / last: curve[k] for k in curve} for curve in of_seeds] for of_seeds in curves)
-    planned_decisions = read_object(runs[0] / "config.json")["recipe"]["total_steps"]
-    return Course(returns, harm, last, sum(seconds) / len(seconds), planned_decisions, planned_seeds)
+    """Learning curves of finished ``runs``, at the steps that all runs have."""
+    curves = [[column(run, name) for run in runs] for name in (RETURN, HARM)]
+    seconds, last = [read_object(run / STATUS)["evaluations"][-1]["cpu_s"] for run in runs], max(curves[1][0])
+    returns, harm = (
+        [{100.0 * k / last: curve[k] for k in sorted(set.intersection(*map(set, of_seeds)))} for curve in of_seeds]
+        for of_seeds in curves
+    )
+    return Course(returns, harm, last, sum(seconds) / len(seconds), planned_seeds)
 
 
 def courses_of(settings: ReproductionSettings, group: str) -> dict[str, Course]:

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
-from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS
 from ethbrake_marl.extensions.reproduction.verdicts import Claim
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.progress import OnProgress
 
 PAPER_EPISODES = 10_000
 
-POLICIES = "PPO and SAC are the shipped policies, trained on paper-random at 0.5 and 0.8 s; they are not the paper's."
+WHO_DRIVES = "PPO and SAC are the shipped policies, trained on paper-random at 0.5 and 0.8 s; they are not the paper's."
 
 
 @dataclass(frozen=True)
@@ -25,13 +24,6 @@ class ReproductionSettings:
     full: bool = False  # train by the paper's own process
     episodes: int = PAPER_EPISODES  # largest number of worlds of an item
     tell: OnProgress = lambda progress: None
-    policies: Mapping[str, str] = field(default_factory=lambda: SHIPPED_SPECS)  # name -> spec
-
-    @property
-    def who_drives(self) -> str:
-        if self.policies == SHIPPED_SPECS:
-            return POLICIES
-        return f"{', '.join(f'{name} is {spec}' for name, spec in self.policies.items())}."
 
 
 class DrawnFigure(NamedTuple):

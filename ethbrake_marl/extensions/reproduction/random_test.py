@@ -69,13 +69,13 @@ def avoided_text(policy: Bools, baseline: Bools) -> str:
     return f"avoids {(baseline & ~policy).sum():,}, adds {(policy & ~baseline).sum():,} of {len(policy):,}"
 
 
-def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED_SPECS) -> RandomTable:
+def table_of(reading: Reading, episodes: int) -> RandomTable:
     """The paper's table of the random test under one interpretation (``reading``) of its text, with 95 % intervals.
 
-    ``policies``: ``SAC`` and ``PPO`` -> agent name. Raises ``InvalidInput`` if the reading needs E-V2X-BM (coupled),
-    which needs exact impacts, in the paper's fixed-step map.
+    Raises ``InvalidInput`` if the reading needs E-V2X-BM (coupled), which needs exact impacts, in the paper's
+    fixed-step map.
     """
-    specs = "", "", policies["SAC"], policies["PPO"]
+    specs = "", "", SHIPPED_SPECS["SAC"], SHIPPED_SPECS["PPO"]
     outcomes = {row: report_outcome(row, reading, episodes, spec) for row, spec in zip(PAPER_ROWS, specs, strict=True)}
     return {row: (rate(collided), mean(harm)) for row, (collided, harm) in outcomes.items()}
 

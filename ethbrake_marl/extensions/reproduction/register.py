@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
-from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.made import WHO_DRIVES, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import PAPER_ROWS, RandomTable, table_of
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.verdicts import PERCENT
@@ -111,7 +111,7 @@ def reproduce_gaps(settings: ReproductionSettings) -> Made:
     rows = []
     for number, (gap, reading) in enumerate(cases):
         settings.tell(Progress("open quantities", number, len(cases)))
-        table = table_of(reading, episodes, settings.policies)
+        table = table_of(reading, episodes)
         rates, harms = zip(*table.values(), strict=True)
         rows.append((gap.name, reading.name, distance(rates_and_harms(table)), *harms, *(rate.value for rate in rates)))
     register = [
@@ -121,7 +121,7 @@ def reproduce_gaps(settings: ReproductionSettings) -> Made:
     collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in PAPER_ROWS]
     note = (
         f"{episodes:,} worlds. Distance: root mean square of ours / printed - 1 over the eight numbers. Then mean harm"
-        f" (m²/s²) with its 95 % interval, and the collision rate. {settings.who_drives} They are not trained anew for"
+        f" (m²/s²) with its 95 % interval, and the collision rate. {WHO_DRIVES} They are not trained anew for"
         " an alternative."
     )
     far = replace(PERCENT, heading="Distance")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import get_args
 
@@ -11,13 +11,14 @@ import numpy as np
 from ethbrake_marl.evaluation.statistics import decrease, mean, rate, unpaired_difference
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, PaperRow
 from ethbrake_marl.extensions.reproduction.learning import RANDOM, courses_of, judge_trained, unconverged_policy
-from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.made import WHO_DRIVES, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.map_bound import collides_in_map
 from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,
     NON_E,
     PLANS,
     ROUNDING,
+    SHIPPED_SPECS,
     WORLD_FIELDS,
     RandomOutcome,
     avoided_text,
@@ -206,12 +207,12 @@ def compare_over_seeds(seeds: Sequence[Mapping[str, RandomOutcome]], smaller: st
     ]
 
 
-def conclusions(outcomes: Mapping[str, RandomOutcome], policies: Iterable[str]) -> dict[str, list[Less]]:
+def conclusions(outcomes: Mapping[str, RandomOutcome]) -> dict[str, list[Less]]:
     """The paper's conclusions from its table: name -> comparisons that must all hold.
 
-    ``outcomes``: strategy -> outcome. ``policies``: names of the learned policies.
+    ``outcomes``: strategy -> outcome.
     """
-    hybrids = [f"Hybrid {name}" for name in policies]
+    hybrids = [f"Hybrid {name}" for name in SHIPPED_SPECS]
     baselines = [name for name in (E_V2X_BM, COUPLED) if name in outcomes]
     return {
         "E-V2X-BM collides less": compare_collisions(outcomes, E_V2X_BM, NON_E),
@@ -224,7 +225,7 @@ def conclusions(outcomes: Mapping[str, RandomOutcome], policies: Iterable[str]) 
         "Non-E harms most": [part for name in (E_V2X_BM, *hybrids) for part in harm_difference(outcomes, name, NON_E)],
         "E-V2X-BM harms less": harm_difference(outcomes, E_V2X_BM, NON_E),
         "hybrids harm least": [part for name in hybrids for part in harm_difference(outcomes, name, NON_E, E_V2X_BM)],
-        "learning harms less": [part for name in policies for part in harm_difference(outcomes, name, *baselines)],
+        "learning harms less": [part for name in SHIPPED_SPECS for part in harm_difference(outcomes, name, *baselines)],
         "hybrid and baseline": [
             part
             for name in hybrids
@@ -232,7 +233,7 @@ def conclusions(outcomes: Mapping[str, RandomOutcome], policies: Iterable[str]) 
         ],
         "hybrid and learning": [
             part
-            for name in policies
+            for name in SHIPPED_SPECS
             for part in (
                 *harm_difference(outcomes, f"Hybrid {name}", name),
                 *compare_collisions(outcomes, f"Hybrid {name}", name),
@@ -247,7 +248,7 @@ def avoidance_claim(policy: str, stated: Mapping[str, RandomOutcome], nearest: M
     return judge(f"{policy} avoids collisions", *parts, numbers=text)
 
 
-def world_claims(outcomes: Mapping[str, RandomOutcome], policies: Iterable[str], least: Floats) -> list[Claim]:
+def world_claims(outcomes: Mapping[str, RandomOutcome], least: Floats) -> list[Claim]:
     """Verdicts on what the paper says of single worlds, with the parameters as stated.
 
     ``outcomes``: strategy -> outcome. ``least``: proven lower bound on the harm, [n] m2/s2.
@@ -255,10 +256,10 @@ def world_claims(outcomes: Mapping[str, RandomOutcome], policies: Iterable[str],
     baseline, certain = outcomes[E_V2X_BM], least > 0.0
     severity = [
         Less.of_worlds(f"{name} minus {E_V2X_BM}", outcomes[name]["first"][certain], baseline["first"][certain])
-        for name in policies
+        for name in SHIPPED_SPECS
     ]
     spared = np.any([~outcome["collided"] for outcome in outcomes.values()], axis=0)
-    exceeded = {name: above_bound(outcomes[f"Hybrid {name}"]) for name in policies}
+    exceeded = {name: above_bound(outcomes[f"Hybrid {name}"]) for name in SHIPPED_SPECS}
     counts = ", ".join(f"{count:,} ({name})" for name, count in exceeded.items())
     some = baseline[PREDICTED] > 0.0
     same = np.isclose(baseline["first"], baseline[PREDICTED], rtol=1e-6)
@@ -319,24 +320,24 @@ def contribution_claims(settings: ReproductionSettings, episodes: int) -> list[C
 
 def reproduce_random_table(settings: ReproductionSettings) -> Made:
     """Table III (``Table:Random``): verdicts on its numbers, the conclusions from it and the paper's contributions."""
-    episodes, policies = settings.episodes, settings.policies
+    episodes = settings.episodes
     least = proven_least_harm(STATED, episodes)
     in_map = least_rates_in_map(episodes, least)
-    rows = {E_V2X_BM: "", NON_E: "", **{f"Hybrid {name}": spec for name, spec in policies.items()}}
+    rows = {E_V2X_BM: "", NON_E: "", **{f"Hybrid {name}": spec for name, spec in SHIPPED_SPECS.items()}}
     stated, nearest = (
         {row: report_outcome(row, reading, episodes, spec) for row, spec in rows.items()}
         for reading in (STATED, NEAREST)
     )
     stated[PREDICTED] = report_outcome(E_V2X_BM, STATED._replace(baseline="predicted"), episodes)
     claims = number_claims(RANDOM_TEST, stated, nearest, least, in_map=rates_in_map(in_map))
-    outcomes, nearest_outcomes = (strategies(reading, episodes, policies) for reading in (STATED, NEAREST))
-    parts, nearest_parts = (conclusions(reading, policies) for reading in (outcomes, nearest_outcomes))
+    outcomes, nearest_outcomes = (strategies(reading, episodes, SHIPPED_SPECS) for reading in (STATED, NEAREST))
+    parts, nearest_parts = (conclusions(reading) for reading in (outcomes, nearest_outcomes))
     claims += [judge(name, parts[name], nearest_parts[name]) for name in parts]
-    claims += [avoidance_claim(name, outcomes, nearest_outcomes) for name in policies]
-    claims += [*world_claims(outcomes, policies, least), *deceleration_claims(episodes)]
+    claims += [avoidance_claim(name, outcomes, nearest_outcomes) for name in SHIPPED_SPECS]
+    claims += [*world_claims(outcomes, least), *deceleration_claims(episodes)]
     claims += [gradient_claim(outcomes, episodes), *contribution_claims(settings, episodes)]
     sheets = [outcomes_sheet("The random test, as stated", outcomes, least), in_map, *process_sheet(settings)]
-    return Made(claims, sheets, notes=[settings.who_drives])
+    return Made(claims, sheets, notes=[WHO_DRIVES])
 
 
 def reproduce_hybrid_table(settings: ReproductionSettings) -> Made:

@@ -12,7 +12,8 @@ from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style
 from ethbrake_marl.extensions.reproduction.learning import process
-from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.made import WHO_DRIVES, DrawnFigure, Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.strategies import PAPERS
 from ethbrake_marl.extensions.reproduction.verdicts import Claim
@@ -84,7 +85,7 @@ def all_records(settings: ReproductionSettings) -> dict[str, Records]:
     the printed ones. If all policies were trained by the paper's process, also ``paper's process``: the first seed of
     each.
     """
-    policies = tuple(settings.policies.items())
+    policies = tuple(SHIPPED_SPECS.items())
     records = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
     trained = tuple((name, specs[0]) for name, specs in process(settings).items())
     return records | ({PAPERS: record_all(STATED, trained)} if len(trained) == len(policies) else {})
@@ -115,7 +116,7 @@ def reproduce_trajectories(settings: ReproductionSettings) -> Made:
                 ),
             }
         )  # fmt: skip
-    return Made(claims_of(parts), figures=figures, notes=[settings.who_drives])
+    return Made(claims_of(parts), figures=figures, notes=[WHO_DRIVES])
 
 
 def reproduce_accelerations(settings: ReproductionSettings) -> Made:

@@ -56,18 +56,18 @@ def paper_texts() -> Mapping[str, Any]:
     return content
 
 
-def sentences_sheet(claims: Mapping[str, Mapping[str, Claim]], *, reasons: bool = True) -> Sheet:
+def sentences_sheet(claims: Mapping[str, Mapping[str, Claim]]) -> Sheet:
     """Table of the paper's sentences, in the paper's order: our results, the verdict and the reason for this verdict.
 
     ``claims``: item -> name -> claim. A sentence of an item that has no such claim was not run, and a sentence of
-    another item is left out. ``reasons``: whether the reasons apply, which are written for the shipped policies.
+    another item is left out.
     """
     rows = []
     for sentence in paper_texts()["sentences"]:
         item, name = sentence["result"].split("/")
         if item in claims:
             claim = claims[item].get(name, Claim(name, "", "", "not run"))
-            why = sentence["why"].get(claim.verdict, REASONS.get(claim.verdict, "")) if reasons else ""
+            why = sentence["why"].get(claim.verdict, REASONS.get(claim.verdict, ""))
             rows.append((sentence["where"], sentence["paper"], *claim[1:], why))
     return Sheet("", [Column(heading, text=True) for heading in COLUMNS], rows)
 

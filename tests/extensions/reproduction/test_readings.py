@@ -1,6 +1,5 @@
 """Readings of the paper: what they change, and the random test under each."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from ethbrake_marl.extensions.reproduction.made import ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,
     HYBRID_PPO,
-    HYBRID_SAC,
     NON_E,
     brake,
     plan,
@@ -196,11 +194,3 @@ def test_register__shows_every_alternative() -> None:
 )  # fmt: skip
 def test_register__quantities_without_effect_have_none(reading: Reading) -> None:
     assert np.array_equal(rates_and_harms(table_of(reading, WORLDS)), rates_and_harms(table_of(STATED, WORLDS)))
-
-
-def test_policies__can_be_others() -> None:
-    table = table_of(STATED._replace(hybrid="policy alone"), 20, {"SAC": "coast", "PPO": "full_brake"})
-    assert table[HYBRID_PPO] == table[NON_E] != table[HYBRID_SAC]
-    settings = replace(SETTINGS, policies={"SAC": "coast", "PPO": "full_brake"})
-    row = register.reproduce_gaps(settings).sheets[1].rows[0]
-    assert row[5] == table_of(STATED, 20, settings.policies)[HYBRID_SAC][1]

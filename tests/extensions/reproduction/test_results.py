@@ -88,7 +88,7 @@ def outcomes(**harm: float) -> dict[str, dict[str, np.ndarray]]:
 
 def test_conclusions__by_planted_harm() -> None:
     planted = outcomes(NonE=10.0, EV2X=5.0, SAC=3.5, PPO=2.0, HSAC=3.0, HPPO=2.5)
-    judged = {name: judge_statement(parts) for name, parts in tables.conclusions(planted, SHIPPED_SPECS).items()}
+    judged = {name: judge_statement(parts) for name, parts in tables.conclusions(planted).items()}
     assert {name: result[:2] for name, result in judged.items()} == {
         "E-V2X-BM collides less": ("does not hold", "differs"),
         "Non-E collides most": ("holds in 0 of 3", "differs"),
@@ -102,7 +102,7 @@ def test_conclusions__by_planted_harm() -> None:
     }
     assert judged["hybrid and learning"][2].startswith("Hybrid PPO minus PPO")
     worse = outcomes(NonE=4.0, EV2X=5.0, SAC=6.0, PPO=6.0, HSAC=5.5, HPPO=4.5)
-    assert [judge_statement(parts)[0] for parts in tables.conclusions(worse, SHIPPED_SPECS).values()] == [
+    assert [judge_statement(parts)[0] for parts in tables.conclusions(worse).values()] == [
         "does not hold", "holds in 0 of 3", "holds in 0 of 4", "holds in 0 of 6", "holds in 0 of 2", "holds in 2 of 8",
         "holds in 0 of 4", "holds in 2 of 6", "holds in 4 of 6",
     ]  # fmt: skip
@@ -135,7 +135,7 @@ def test_worlds__by_hand() -> None:
     planted[E_V2X_BM][PREDICTED] = np.array([5.0, 2.0, 2.0, 0.0])
     planted["Hybrid SAC"][PREDICTED], planted[HYBRID_PPO][PREDICTED] = np.array([4.0, 2.0, 9.0, 9.0]), np.full(4, 9.0)
     claims = {claim.name: claim for claim in
-              tables.world_claims(planted, SHIPPED_SPECS, np.array([1.0, 1.0, 0.0, 0.0]))}  # fmt: skip
+              tables.world_claims(planted, np.array([1.0, 1.0, 0.0, 0.0]))}  # fmt: skip
     assert claims["severity of certain collisions"].verdict == "agrees"
     assert claims["three vehicles"].verdict == "agrees"
     assert claims["expected is overall"].ours == "holds in 33.3 % [6.1, 79.2] of 3 worlds with H* > 0"
@@ -226,7 +226,7 @@ def ppo_is_unconverged(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def process_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    course = Course([{k: -9.0 + min(k, 3) for k in range(9)}] * 2, [{100.0: 1.0}] * 2, 9_000.0, 7.0, 9_000.0, 5)
+    course = Course([{k: -9.0 + min(k, 3) for k in range(9)}] * 2, [{100.0: 1.0}] * 2, 9_000.0, 7.0, 5)
     monkeypatch.setattr(
         strategies, "process", lambda settings: {name: [spec, spec] for name, spec in SHIPPED_SPECS.items()}
     )
@@ -292,7 +292,7 @@ def test_statements__of_the_distance_by_planted_harm() -> None:
     harm = {NON_E: (5.0, 9.0), E_V2X_BM: (7.0, 1.0), "SAC": (6.0, 0.5), "PPO": (8.0, 0.1)}
     lines = {name: np.where(near, *values) + k * tenths for k, (name, values) in enumerate(harm.items())}
     groups = {"10-12 m": (lines, near), "12-14 m": (lines, far)}
-    judged = [judge_statement(parts) for parts in curves.statements(groups, SHIPPED_SPECS).values()]
+    judged = [judge_statement(parts) for parts in curves.statements(groups).values()]
     assert [each[:2] for each in judged] == [
         ("holds in 3 of 6", "differs"), ("holds", "agrees"), ("holds in 1 of 2", "differs"), ("holds", "agrees"),
         ("holds in 3 of 4", "differs"),
