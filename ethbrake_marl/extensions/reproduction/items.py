@@ -102,10 +102,7 @@ ITEMS = (
 
 RESULTS_FILE = "README.md"
 
-PAPER = "*How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning*"
-
 QUICK_NOTE = "Rows that were not run need --full, or trainings of an earlier --full in the same folder."
-SENTENCES = "## The paper, sentence by sentence"
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
@@ -208,9 +205,9 @@ def overview(results: Mapping[Item, Made]) -> Sheet:
 
 def page(made_by: str, results: Mapping[Item, Made], settings: ReproductionSettings) -> str:
     """Page of all results as Markdown. ``made_by``: command, date, computer and versions."""
-    lead = f"Numbers, statements and figures of {PAPER}, and ours. Made by {made_by}."
+    lead = f"Numbers, statements and figures of the paper *How to Brake?*, and ours. Made by {made_by}."
     parts = ["# The paper, reproduced", lead, *([] if settings.full else [QUICK_NOTE])]
-    table = [SENTENCES, paper_texts()["lead"], markdown(overview(results))]
+    table = ["## The paper, sentence by sentence", paper_texts()["lead"], markdown(overview(results))]
     if CHANGES not in results:
         parts += table
     for item, result in results.items():

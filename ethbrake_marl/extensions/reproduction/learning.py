@@ -320,14 +320,20 @@ def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
 
 def claims_at_high_delay(high: Mapping[str, Course]) -> list[Claim]:
     """Verdicts on the paper's statements about the learning curves at the high delay. ``high``: algorithm -> curves."""
-    unrest = {name: course.unrest - ALIKE * course.rise for name, course in high.items()}
     apart = np.abs(high["PPO"].last - high["SAC"].last) - ALIKE * high["PPO"].rise
     parts = {
-        "steady": [Less(f"{name}: deviation minus a tenth of the rise", mean(unrest[name])) for name in high],
+        "steady": [steadiness(name, course) for name, course in high.items()],
         "alike": [Less("difference minus a tenth of PPO's rise", mean(apart))],
-        "PPO suits": [Less.of_lists("PPO minus SAC, harm", high["PPO"].last_harm, high["SAC"].last_harm)],
+        "PPO suits": [
+            Less.of_lists("PPO minus SAC, deviation in the last quarter", high["PPO"].unrest, high["SAC"].unrest),
+            Less.of_lists("PPO minus SAC, harm", high["PPO"].last_harm, high["SAC"].last_harm),
+        ],
     }
     return [judge_trained(name, high, part) for name, part in parts.items()]
+
+
+def steadiness(name: str, course: Course) -> Less:
+    return Less(f"{name}: deviation minus a tenth of the rise", mean(course.unrest - ALIKE * course.rise))
 
 
 def claims_at_low_delay(high: Mapping[str, Course], low: Mapping[str, Course]) -> list[Claim]:
@@ -346,8 +352,15 @@ def claims_at_low_delay(high: Mapping[str, Course], low: Mapping[str, Course]) -
     safer = [Less.of_lists(f"{name}, harm", low[name].last_harm, high[name].last_harm) for name in high]
     varied = [Less.of_lists(name, high[name].spread, low[name].spread) for name in high]
     steadier = [Less.of_lists("PPO minus SAC, deviation in the last quarter", ppo.unrest, sac.unrest)]
-    suits = [Less.of_lists("SAC minus PPO, harm", sac.last_harm, ppo.last_harm)]
+    suits = [*faster, Less.of_lists("SAC minus PPO, harm", sac.last_harm, ppo.last_harm)]
+    robust = {
+        name: {f"{name}, {delay}": courses[name] for delay, courses in ((HIGH, high), (LOW, low))} for name in low
+    }
     return [
+        *(
+            judge_trained(f"{name} converges", both_delays, [steadiness(at, both_delays[at]) for at in both_delays])
+            for name, both_delays in robust.items()
+        ),
         claim._replace(verdict="undecided") if claim.verdict != "not converged" else claim,
         judge_trained("higher", both, higher),
         judge_trained("safer", both, safer),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -44,6 +43,7 @@ from ethbrake_marl.extensions.reproduction.verdicts import (
     Claim,
     Less,
     Verdict,
+    chance_difference,
     judge,
     judge_number,
     judge_share,
@@ -61,6 +61,11 @@ STARS: Sequence[Star] = get_args(Star)
 
 UNCONVERGED = STANDALONE, "Hybrid"  # rows of a policy that has not converged; where ours stops is our choice
 MAP_WORLDS, MAP_STEPS_S = 250, (0.1, 0.2, 0.25, 0.3)  # of the bound in the paper's map
+
+MAP_NOTE = (
+    f"Exact impacts in all worlds, plus the difference of the map in the first {MAP_WORLDS} (a mixed-integer linear"
+    " programme for each)."
+)
 
 ReportedRows = Mapping[str, tuple[Bools, Floats]]  # row of the paper -> collided, harm (m2/s2), [n] each
 
@@ -80,16 +85,24 @@ def reported_as(agent: str, quantity: str) -> str:
 
 
 def number_claims(
-    printed: Sequence[PaperRow], stated: ReportedRows, nearest: ReportedRows, least: Floats, *, in_map: str = ""
+    printed: Sequence[PaperRow],
+    stated: ReportedRows,
+    nearest: ReportedRows,
+    least: Floats,
+    in_map: Mapping[str, Estimate],
 ) -> list[Claim]:
     """Verdict on every number that the paper prints in a table.
 
     ``stated``, ``nearest``: our outcomes with the paper's parameters as stated, and under the interpretation of the
     paper whose results come nearest to the printed ones. ``least``: proven lower bound on the harm with the parameters
-    as stated, [n] m2/s2. ``in_map``: bound in the paper's map, in words. A row of a policy that has not converged is
-    "undecided", unless a bound decides it.
+    as stated and exact impacts, [n] m2/s2. ``in_map``: least collision rates in the paper's map, by time step. A number
+    "cannot be" if the bounds for exact impacts and for each time step of the map are above it; no bound on harm holds
+    in the map. A row of a policy that has not converged is "undecided", unless the bounds decide it.
     """
-    claims, proven = [], {RATE: rate(least > 0.0), AVERAGE: mean(least)}
+    claims, exact = [], {RATE: rate(least > 0.0), AVERAGE: mean(least)}
+    bounds = exact[RATE], *in_map.values()
+    weakest = {RATE: min(bounds, key=lambda bound: bound.value - chance_difference(bound))}
+    map_rates = ", ".join(f"{PERCENT.show(bound).in_words} (steps of {step})" for step, bound in in_map.items())
     for row in printed:
         numbers = {RATE: row.collision_rate, AVERAGE: row.average_harm, DECREASE: row.harm_decrease}
         for quantity, number in numbers.items():
@@ -99,11 +112,12 @@ def number_claims(
             our_estimate, nearest_estimate = (
                 table_estimate(quantity, outcomes[row.agent], outcomes[NON_E]) for outcomes in (stated, nearest)
             )
-            verdict = judge_number(number, our_estimate, proven.get(quantity))
+            verdict = judge_number(number, our_estimate, weakest.get(quantity))
             ours = show.show(our_estimate).in_words
-            if verdict == "cannot be":
-                ours += f"; at least {show.show(proven[quantity]).in_words}, whoever drives{in_map}"
-            elif row.agent in UNCONVERGED:
+            if judge_number(number, our_estimate, exact.get(quantity)) == "cannot be":
+                ours += f"; with exact impacts at least {show.show(exact[quantity]).in_words}, whoever drives"
+                ours += f"; in the paper's map at least {map_rates}" if quantity == RATE else ""
+            if row.agent in UNCONVERGED and verdict != "cannot be":
                 verdict = "undecided"
             if (row.agent, quantity) == (E_V2X_BM, AVERAGE) and PREDICTED in stated:
                 ours += f" (predicted: {show.show(mean(stated[PREDICTED][1])).in_words})"
@@ -113,28 +127,18 @@ def number_claims(
     return claims
 
 
-def rates_in_map(sheet: Sheet) -> str:
-    """The rates of ``least_rates_in_map``, in words."""
-    steps, _, rates = zip(*sheet.formatted_rows(), strict=True)
-    shares, lengths = (", ".join(cell.value for cell in cells) for cells in (rates, steps))
-    return f"; in the paper's map at least {shares} collide (steps of {lengths})"
-
-
-def least_rates_in_map(episodes: int, least: Floats) -> Sheet:
-    """Table of the least collision rate in the paper's map, for several time steps.
+def least_rates_in_map(episodes: int, least: Floats) -> dict[str, Estimate]:
+    """Least collision rates in the paper's map: time step, in words -> rate.
 
     Each rate is that of exact impacts in all worlds (``least``: proven lower bound on the harm, [n] m2/s2), plus the
     difference between map and exact impacts in the first worlds: both bounds fail in nearly the same worlds.
     """
-    certain = (least > 0.0).astype(np.float64)
-    few, rows = min(MAP_WORLDS, episodes), []
-    for step_s in MAP_STEPS_S:
-        collides = collides_in_map(STATED._replace(step_s=step_s), few)
-        more = unpaired_difference(mean(certain), mean(certain[:few] - collides))
-        rows.append((f"{step_s:g} s", rate(collides), more))
-    columns = "Time step", replace(PERCENT, heading=f"First {few:,} worlds"), replace(PERCENT, heading="All worlds")
-    note = "A mixed-integer linear programme per world. All worlds: exact impacts, plus the difference in the first."
-    return Sheet("Least collision rate in the paper's map", columns, rows, note)
+    certain, few = (least > 0.0).astype(np.float64), min(MAP_WORLDS, episodes)
+    collides = {step_s: collides_in_map(STATED._replace(step_s=step_s), few) for step_s in MAP_STEPS_S}
+    return {
+        f"{step_s:g} s": unpaired_difference(mean(certain), mean(certain[:few] - rows))
+        for step_s, rows in collides.items()
+    }
 
 
 def outcomes_sheet(title: str, outcomes: Mapping[str, RandomOutcome], least: Floats) -> Sheet:
@@ -201,9 +205,9 @@ def compare_over_seeds(seeds: Sequence[Mapping[str, RandomOutcome]], smaller: st
     return [
         Less(
             f"{smaller} minus {larger}, {harm}",
-            mean(np.array([seed[smaller][count].mean() - seed[larger][count].mean() for seed in seeds])),
+            mean(np.array([scale * (seed[smaller][count].mean() - seed[larger][count].mean()) for seed in seeds])),
         )
-        for count, harm in (*HARMS.items(), ("collided", "collision rate"))
+        for count, harm, scale in (*((*names, 1.0) for names in HARMS.items()), ("collided", "% of worlds", 100.0))
     ]
 
 
@@ -259,8 +263,9 @@ def world_claims(outcomes: Mapping[str, RandomOutcome], least: Floats) -> list[C
         for name in SHIPPED_SPECS
     ]
     spared = np.any([~outcome["collided"] for outcome in outcomes.values()], axis=0)
-    exceeded = {name: above_bound(outcomes[f"Hybrid {name}"]) for name in SHIPPED_SPECS}
-    counts = ", ".join(f"{count:,} ({name})" for name, count in exceeded.items())
+    hybrids = [f"Hybrid {name}" for name in SHIPPED_SPECS]
+    exceeded = {name: above_bound(outcomes[name]) for name in hybrids}
+    worse = {name: count_worse(outcomes[name], baseline) for name in (*hybrids, *SHIPPED_SPECS)}
     some = baseline[PREDICTED] > 0.0
     same = np.isclose(baseline["first"], baseline[PREDICTED], rtol=1e-6)
     avoidable = {f"{name}'s avoidable collisions": outcomes[name]["collided"] & spared for name in (NON_E, E_V2X_BM)}
@@ -268,12 +273,8 @@ def world_claims(outcomes: Mapping[str, RandomOutcome], least: Floats) -> list[C
         judge("severity of certain collisions", severity),
         judge("three vehicles", harm_difference(outcomes, COUPLED, E_V2X_BM)),
         judge_share("expected is overall", same[some], "worlds with H* > 0"),
-        Claim(
-            "safety bound",
-            f"exceeded in {counts} of {len(least):,} worlds",
-            "",
-            "differs" if any(exceeded.values()) else "agrees",
-        ),
+        bound_claim("safety bound", "H*", exceeded, len(least)),
+        bound_claim("never worse", "E-V2X-BM's harm", worse, len(least)),
         *(
             Claim(
                 name, f"in {PERCENT.show(rate(rows)).in_words} of all worlds", "", "agrees" if any(rows) else "differs"
@@ -281,6 +282,21 @@ def world_claims(outcomes: Mapping[str, RandomOutcome], least: Floats) -> list[C
             for name, rows in avoidable.items()
         ),
     ]
+
+
+def bound_claim(name: str, bound: str, above: Mapping[str, int], worlds: int) -> Claim:
+    """Verdict: the harm of no hybrid is above a bound in any world.
+
+    ``above``: strategy -> number of worlds in which its harm is above it.
+    """
+    counts = ", ".join(f"{count:,} ({strategy})" for strategy, count in above.items())
+    differs = any(count for strategy, count in above.items() if strategy.startswith("Hybrid"))
+    return Claim(name, f"above {bound} in {counts} of {worlds:,} worlds", "", "differs" if differs else "agrees")
+
+
+def count_worse(outcome: RandomOutcome, baseline: RandomOutcome) -> int:
+    """Number of worlds in which a strategy does more first-impact harm, or more total harm, than ``baseline``."""
+    return int(np.count_nonzero(np.any([outcome[harm] > baseline[harm] + ROUNDING for harm in HARMS], axis=0)))
 
 
 def deceleration_claims(episodes: int) -> list[Claim]:
@@ -329,14 +345,15 @@ def reproduce_random_table(settings: ReproductionSettings) -> Made:
         for reading in (STATED, NEAREST)
     )
     stated[PREDICTED] = report_outcome(E_V2X_BM, STATED._replace(baseline="predicted"), episodes)
-    claims = number_claims(RANDOM_TEST, stated, nearest, least, in_map=rates_in_map(in_map))
+    claims = number_claims(RANDOM_TEST, stated, nearest, least, in_map)
     outcomes, nearest_outcomes = (strategies(reading, episodes, SHIPPED_SPECS) for reading in (STATED, NEAREST))
     parts, nearest_parts = (conclusions(reading) for reading in (outcomes, nearest_outcomes))
     claims += [judge(name, parts[name], nearest_parts[name]) for name in parts]
     claims += [avoidance_claim(name, outcomes, nearest_outcomes) for name in SHIPPED_SPECS]
     claims += [*world_claims(outcomes, least), *deceleration_claims(episodes)]
     claims += [gradient_claim(outcomes, episodes), *contribution_claims(settings, episodes)]
-    sheets = [outcomes_sheet("The random test, as stated", outcomes, least), in_map, *process_sheet(settings)]
+    bounds = Sheet("Least collision rate in the paper's map", ("Time step", PERCENT), [*in_map.items()], MAP_NOTE)
+    sheets = [outcomes_sheet("The random test, as stated", outcomes, least), bounds, *process_sheet(settings)]
     return Made(claims, sheets, notes=[WHO_DRIVES])
 
 
@@ -352,9 +369,7 @@ def reproduce_hybrid_table(settings: ReproductionSettings) -> Made:
         policy_rows = {STANDALONE: alone, "Hybrid": hybrid, PREDICTED: predicted}
         return {row: report_outcome(row, reading, episodes) for row in (NON_E, E_V2X_BM)} | policy_rows
 
-    claims = number_claims(
-        HYBRID_TEST, rows(STATED), rows(NEAREST), least, in_map=rates_in_map(least_rates_in_map(episodes, least))
-    )
+    claims = number_claims(HYBRID_TEST, rows(STATED), rows(NEAREST), least, least_rates_in_map(episodes, least))
     first, second, avoided = (row.episodes - row.collisions for row in HYBRID_TEST)
     verdict: Verdict = "cannot be" if avoided > first + second else "agrees"
     claims.append(Claim("avoided", f"at most {first:,} + {second:,} = {first + second:,}", "", verdict))

@@ -192,7 +192,7 @@ def claims_of(readings: Sequence[Mapping[str, tuple[str, float]]]) -> list[Claim
     claims = []
     for name, (words, stated) in readings[0].items():
         ours, nearest = ("holds" if value < 0.0 else "does not hold" for value in (stated, readings[1][name][1]))
-        claims.append(Claim(name, f"{ours}: {words}", nearest, "agrees" if stated < 0.0 else "undecided"))
+        claims.append(Claim(name, f"{ours}: {words}", nearest, "agrees" if stated < 0.0 else "differs"))
     return claims
 
 

@@ -61,13 +61,16 @@ def test_results__have_a_number_in_each_row_that_was_run_and_the_reason_for_its_
         assert why or verdict == "agrees"
 
 
+COUNTED = {
+    "agrees": "agree", "differs": "differ", "cannot be": "cannot be", "undecided": "are undecided",
+    "not converged": "rest on a training that has not converged", "not run": "wait for a long training",
+}  # fmt: skip
+
+
 def test_readme__has_the_number_of_each_verdict() -> None:
     count = Counter(row[4] for row in sentences())
-    assert (
-        f"of its {len(SENTENCES)} sentences and numbers, {count['agrees']} agree, {count['differs']} differ,"
-        f" {count['cannot be']} cannot be, {count['undecided']} are undecided, {count['not converged']} rest on a"
-        f" training that has not converged, and {count['not run']} wait for a long training"
-    ) in " ".join(README.split())
+    *verdicts, last = (f"{count[verdict]} {words}" for verdict, words in COUNTED.items() if count[verdict])
+    assert f"of its {len(SENTENCES)} results, {', '.join(verdicts)}, and {last}" in " ".join(README.split())
 
 
 def test_sentences__are_judged_by_claims_that_the_code_makes_and_no_claim_is_left_out(
@@ -93,7 +96,7 @@ def test_sentences__are_judged_by_claims_that_the_code_makes_and_no_claim_is_lef
 def test_results__are_those_of_this_version_and_the_non_ethical_row_of_today() -> None:
     assert f"version {__version__}, physics {physics_digest()})" in " ".join(PAGE.split())
     stated, nearest = ({NON_E: report_outcome(NON_E, reading, PAPER_EPISODES)} for reading in (STATED, NEAREST))
-    claims = tables.number_claims(RANDOM_TEST[:1], stated, nearest, 0.0 * stated[NON_E][1])
+    claims = tables.number_claims(RANDOM_TEST[:1], stated, nearest, 0.0 * stated[NON_E][1], {})
     rows = [row[2:5] for row in sentences() if row[1].startswith(f"{NON_E}, ")]
     assert rows == [[*claim[1:]] for claim in claims]
 

@@ -33,6 +33,7 @@ from ethbrake_marl.extensions.reproduction.random_test import (
 from ethbrake_marl.extensions.reproduction.readings import RANDOM, STATED, Reading
 from ethbrake_marl.extensions.reproduction.strategies import COUPLED, PREDICTED
 from ethbrake_marl.extensions.reproduction.verdicts import Claim, Verdict, judge_statement
+from ethbrake_marl.files.sheet import Estimate
 
 SETTINGS = ReproductionSettings(Path("unused"), episodes=100)
 
@@ -132,6 +133,7 @@ def test_worlds__by_hand() -> None:
     planted = outcomes(EV2X=5.0, NonE=9.0, SAC=4.0, PPO=3.0, HSAC=4.0, HPPO=3.0)
     planted[COUPLED] = {**planted[E_V2X_BM], "first": planted[E_V2X_BM]["first"] - 1.0,
                         "total": planted[E_V2X_BM]["total"] - 1.0}  # fmt: skip
+    planted["SAC"]["total"] = planted["SAC"]["total"] + np.array([0.0, 0.0, 0.0, 2.0])
     planted[E_V2X_BM][PREDICTED] = np.array([5.0, 2.0, 2.0, 0.0])
     planted["Hybrid SAC"][PREDICTED], planted[HYBRID_PPO][PREDICTED] = np.array([4.0, 2.0, 9.0, 9.0]), np.full(4, 9.0)
     claims = {claim.name: claim for claim in
@@ -139,7 +141,10 @@ def test_worlds__by_hand() -> None:
     assert claims["severity of certain collisions"].verdict == "agrees"
     assert claims["three vehicles"].verdict == "agrees"
     assert claims["expected is overall"].ours == "holds in 33.3 % [6.1, 79.2] of 3 worlds with H* > 0"
-    assert claims["safety bound"][1:] == ("exceeded in 0 (PPO), 1 (SAC) of 4 worlds", "", "differs")
+    exceeded = "above H* in 0 (Hybrid PPO), 1 (Hybrid SAC) of 4 worlds"
+    assert claims["safety bound"][1:] == (exceeded, "", "differs")
+    above = "above E-V2X-BM's harm in 0 (Hybrid PPO), 0 (Hybrid SAC), 0 (PPO), 1 (SAC) of 4 worlds"
+    assert claims["never worse"][1:] == (above, "", "agrees")  # whatever the policies alone do
     assert claims[f"{NON_E}'s avoidable collisions"].ours == "in 25.0 % [4.6, 69.9] of all worlds"  # the third world
 
 
@@ -198,18 +203,22 @@ def test_numbers__by_hand() -> None:
     three, half = worlds % 4 > 0, worlds % 2 > 0
     stated = {NON_E: (three, np.full(400, 10.0)), E_V2X_BM: (half, np.full(400, 6.0))}
     nearest = {NON_E: (three, np.full(400, 12.0)), E_V2X_BM: (three, np.full(400, 3.0))}
-    claims = tables.number_claims(printed, stated, nearest, 8.0 * half, in_map="; in the map more")
+    in_map = {"0.1 s": Estimate(0.6, (0.5, 0.7)), "0.2 s": Estimate(0.5, (0.4, 0.6))}
+    claims = tables.number_claims(printed, stated, nearest, 8.0 * half, in_map)
     three_quarters, one_half = "75.0 % [70.5, 79.0]", "50.0 % [45.1, 54.9]"
-    least = "; at least {}, whoever drives; in the map more".format
+    least = "; with exact impacts at least {}, whoever drives".format
+    rates = "60.0 % [50.0, 70.0] (steps of 0.1 s), 50.0 % [40.0, 60.0] (steps of 0.2 s)"
+    bounds = f"{least(one_half)}; in the paper's map at least {rates}"
     assert claims == [
         ("Non-E, collision rate", three_quarters, f"{three_quarters}, agrees", "agrees"),
         ("Non-E, average harm", "10.00 [10.00, 10.00]", "12.00 [12.00, 12.00], differs", "agrees"),
-        ("E-V2X-BM, collision rate", one_half + least(one_half), f"{three_quarters} (what happens), differs",
-         "cannot be"),
+        ("E-V2X-BM, collision rate", one_half + bounds, f"{three_quarters} (what happens), differs", "cannot be"),
         ("E-V2X-BM, average harm", "6.00 [6.00, 6.00]" + least("4.00 [3.61, 4.39]"),
-         "3.00 [3.00, 3.00] (predicted), agrees", "cannot be"),
+         "3.00 [3.00, 3.00] (predicted), agrees", "differs"),
         ("E-V2X-BM, harm decrease", "40.0 % [40.0, 40.0]", "75.0 % [75.0, 75.0] (predicted), differs", "differs"),
     ]  # fmt: skip
+    in_map["0.3 s"] = Estimate(0.4, (0.3, 0.5))  # 0.3 is within chance
+    assert tables.number_claims(printed, stated, nearest, 8.0 * half, in_map)[2].verdict == "differs"
 
 
 def by_name(made: Made) -> dict[str, tuple[str, str, Verdict]]:
@@ -238,9 +247,10 @@ def process_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_random_table__has_every_printed_number_and_the_papers_process() -> None:
     made = tables.reproduce_random_table(SETTINGS)
     claims, (stated, in_map, process) = by_name(made), made.sheets
-    assert len(claims) == 11 + 9 + 2 + 6 + 2 + 1 + 4
+    assert len(claims) == 11 + 9 + 2 + 7 + 2 + 1 + 4
     assert [row[0] for row in in_map.rows] == ["0.1 s", "0.2 s", "0.25 s", "0.3 s"]
-    assert in_map.rows[1][2].value == pytest.approx(in_map.rows[1][1].value)  # as many worlds as in the list
+    collides = map_bound.collides_in_map(STATED._replace(step_s=0.2), 100)
+    assert in_map.rows[1][1].value == pytest.approx(collides.mean())  # as many worlds as in the list
     length = "2 of 5 seeds, 9,000 decisions, 7 CPU-s, last third +0.00 of 3.0"
     assert claims["PPO by the process"][0].endswith(f"(PPO: {length})") and f"SAC: {length}." in process.note
     rate = claims["Non-E, collision rate"]
@@ -294,17 +304,37 @@ def test_statements__of_the_distance_by_planted_harm() -> None:
     groups = {"10-12 m": (lines, near), "12-14 m": (lines, far)}
     judged = [judge_statement(parts) for parts in curves.statements(groups).values()]
     assert [each[:2] for each in judged] == [
-        ("holds in 3 of 6", "differs"), ("holds", "agrees"), ("holds in 1 of 2", "differs"), ("holds", "agrees"),
+        ("holds in 3 of 6", "differs"), ("holds in 1 of 2", "differs"), ("holds", "agrees"),
         ("holds in 3 of 4", "differs"),
     ]  # fmt: skip
-    assert judged[2][2].startswith("E-V2X-BM minus Non-E, 10-12 m, +2.10")
-    assert judged[4][2].startswith("PPO minus E-V2X-BM, 10-12 m, +1.20")
+    assert judged[1][2].startswith("E-V2X-BM minus Non-E, 10-12 m, +2.10")
+    assert judged[3][2].startswith("PPO minus E-V2X-BM, 10-12 m, +1.20")
+    lines[EXPECTED] = 0.1 * lines[NON_E]
+    predicted = [judge_statement(parts)[1] for parts in curves.statements(groups, EXPECTED).values()]
+    assert predicted == ["differs", "agrees", "differs", "differs"]
+    assert judge_statement(curves.growth_between_groups(groups, NON_E))[:2] == ("holds", "agrees")
+
+
+def test_advantage__is_largest_where_the_policy_gains_most() -> None:
+    near, far = np.arange(60) < 30, np.arange(60) >= 30
+    lines = {E_V2X_BM: np.where(near, 9.0, 3.0), "PPO": np.ones(60), "SAC": np.where(near, 5.0, 1.0)}
+    lines = {name: line + 0.1 * (np.arange(60) % 3) for name, line in lines.items()}
+    claim = curves.advantage_claim({"10-12 m": (lines, near), "12-14 m": (lines, far)})
+    text = "minus E-V2X-BM, by distance: PPO -8.00, -2.00; SAC -4.00, -2.00"
+    assert claim.ours == f"holds in 2 of 2: {text}" and claim.verdict == "agrees"
+    assert curves.advantage_claim({"10-12 m": (lines, far), "12-14 m": (lines, near)}).verdict == "differs"
+
+
+def test_time__alone_makes_harm_certain() -> None:
+    claim = curves.time_claim(replace(SETTINGS, episodes=200))
+    least = [float(text) for text in re.findall(r"(\d+\.\d\d) at", claim.ours)]
+    assert claim.verdict == "agrees" and least == sorted(least) and least[0] < 0.3 * least[-1]
 
 
 @pytest.mark.usefixtures("process_is_shipped")
 def test_distance__figure_and_tables_have_the_same_numbers() -> None:
     made = curves.reproduce_distance(SETTINGS)
-    assert len(by_name(made)) == 5 + 2 + 2 + 2
+    assert len(by_name(made)) == 2 * 4 + 1 + 3 + 2 + 2
     stated, *others = (axes.lines for axes in made.figures[0].figure.axes)
     for lines, sheet in zip((stated, *others), made.sheets, strict=True):
         rows = {name: [each.value for each in cells] for name, *cells in sheet.rows}
@@ -328,7 +358,7 @@ def test_illustration__counts_the_worlds_in_which_the_hybrid_is_not_the_better(m
 def test_delays__in_the_world_of_the_figure() -> None:
     made = curves.reproduce_delays(replace(SETTINGS, episodes=50))
     assert {name: claim[2] for name, claim in by_name(made).items()} == dict.fromkeys(
-        ("learning harms least", "robust", "room"), "agrees"
+        ("learning harms least", "robust", "room", "time"), "agrees"
     )
     (sheet,) = made.sheets
     assert sheet.headings == ["Strategy", "low (0.1, 0.3 s)", "middle (0.3, 0.6 s)", "high (0.8, 1.2 s)"]
@@ -366,15 +396,15 @@ def test_trajectories_and_accelerations__have_these_numbers() -> None:
     claims = {(k, *claim) for k, item in enumerate(made) for claim in item.claims}
     assert claims == {
         (0, "alike in Scenario 1", "does not hold: root mean square 2.06 m against 0.88 m", "does not hold",
-         "undecided"),
+         "differs"),
         (0, "PPO from Vehicle 3", "holds: mean gap 5.92 m under SAC, 6.70 m under PPO", "holds", "agrees"),
         (0, "SAC from Vehicle 1", "holds: mean gap 3.28 m under PPO, 4.05 m under SAC", "holds", "agrees"),
         (1, "alike in Scenario 1", "does not hold: root mean square difference 3.13 m/s² against 2.16 m/s²",
-         "does not hold", "undecided"),
+         "does not hold", "differs"),
         (1, "PPO accelerates", "holds: first command +7.00 m/s²", "holds", "agrees"),
         (1, "SAC decelerates", "holds: braking in 100 % of the time it moves", "holds", "agrees"),
         (1, "PPO is smoother", "does not hold: ups and downs 17.4 m/s² under PPO, 8.9 m/s² under SAC", "holds",
-         "undecided"),
+         "differs"),
     }  # fmt: skip
 
 
