@@ -16,7 +16,7 @@ from ethbrake_marl.extensions.reproduction.made import WHO_DRIVES, DrawnFigure, 
 from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.strategies import PAPERS
-from ethbrake_marl.extensions.reproduction.verdicts import Claim
+from ethbrake_marl.extensions.reproduction.verdicts import Claim, Verdict
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game, teams_of
@@ -98,7 +98,7 @@ def reproduce_trajectories(settings: ReproductionSettings) -> Made:
     for number, (name, records) in enumerate(readings.items(), 1):
         text = f"Positions of the vehicles, {name}; an arrow every second, dashed lines join equal times."
         figures.append(DrawnFigure(f"trajectories-{number}", f"Trajectories, {name}", text, road_figure(records, text)))
-    for records in (readings["as stated"], readings["nearest reading"]):
+    for records in readings.values():
         smaller, larger = (policy_difference(records, k, "positions_m") for k in PAPER_SCENARIOS)
         (ppo_1, sac_1), (ppo_2, sac_2) = (
             [float(gap.mean()) for gap in resample_pair(records, 2, "gaps_m", pair)] for pair in (0, 1)
@@ -124,7 +124,7 @@ def reproduce_accelerations(settings: ReproductionSettings) -> Made:
     readings, parts = all_records(settings), []
     text = "Command of Vehicle 2 over time, as the paper states the latencies and under other readings."
     figure = DrawnFigure("accelerations", "Acceleration profiles", text, profiles_figure(readings, text))
-    for records in (readings["as stated"], readings["nearest reading"]):
+    for records in readings.values():
         in_1, in_2 = (policy_difference(records, k, "command_mps2") for k in PAPER_SCENARIOS)
         (first, ppo_changes, _), (_, sac_changes, braking) = (profile_of(records[name, 2]) for name in ("PPO", "SAC"))
         # statement -> (what we measured, a number below 0 if the statement holds)
@@ -186,13 +186,18 @@ def policy_difference(records: Records, number: int, what: str) -> float:
 def claims_of(readings: Sequence[Mapping[str, tuple[str, float]]]) -> list[Claim]:
     """Verdicts on claims of the paper that one quantity is smaller than another in a single world.
 
-    ``readings``: results with the parameters as stated, then in the nearest reading. Each maps a claim to numbers in
-    words, and to the smaller quantity minus the larger one.
+    A claim agrees, or differs, if the shipped policies and those of the paper's process say so, and else is undecided.
+    ``readings``: results with the parameters as stated, in the nearest reading and, if it was trained, of the paper's
+    process. Each maps a claim to numbers in words, and to the smaller quantity minus the larger one.
     """
-    claims = []
-    for name, (words, stated) in readings[0].items():
-        ours, nearest = ("holds" if value < 0.0 else "does not hold" for value in (stated, readings[1][name][1]))
-        claims.append(Claim(name, f"{ours}: {words}", nearest, "agrees" if stated < 0.0 else "differs"))
+    claims, texts = [], {True: "holds", False: "does not hold"}
+    verdicts: dict[bool, Verdict] = {True: "agrees", False: "differs"}
+    for name in readings[0]:
+        stated, nearest, *process = (reading[name] for reading in readings)
+        holds = [value < 0.0 for _, value in (stated, *process)]
+        words = (f"{texts[value]}: {words}" for value, (words, _) in zip(holds, (stated, *process), strict=True))
+        verdict = verdicts[holds[0]] if holds[1:] == holds[:1] else "undecided"
+        claims.append(Claim(name, "; by the paper's process it ".join(words), texts[nearest[1] < 0.0], verdict))
     return claims
 
 

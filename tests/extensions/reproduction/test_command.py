@@ -39,7 +39,7 @@ def test_reproduce__writes_page_figures_and_tables(ethbrake: Command, empty_fold
     done = ethbrake("reproduce", "accelerations", "--episodes", "3", "--output", "out", "--json")
     (result,) = told_json(done)
     assert result["name"] == "accelerations" and len(result["tables"]["Commands of Vehicle 2"]) == 8
-    assert [each["Verdict"] for each in result["claims"]] == ["differs", "agrees", "agrees", "differs"]
+    assert [each["Verdict"] for each in result["claims"]] == ["undecided"] * 4
     assert [each["Why"] != "" for each in result["claims"]] == [True] * 4
     page = Path("out/README.md").read_text("utf-8")
     assert "Made by `ethbrake reproduce accelerations --episodes 3` on 20" in page
