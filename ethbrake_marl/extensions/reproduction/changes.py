@@ -8,7 +8,7 @@ import numpy as np
 
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST
 from ethbrake_marl.extensions.reproduction.curves import DISTANCE, DISTANCE_WORLDS, by_distance, harm_of_strategies
-from ethbrake_marl.extensions.reproduction.made import WHO_DRIVES, Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.made import DRIVERS, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, NON_E, ROUNDING, SHIPPED_SPECS, RandomOutcome
 from ethbrake_marl.extensions.reproduction.readings import STATED
 from ethbrake_marl.extensions.reproduction.strategies import (
@@ -67,7 +67,7 @@ def reproduce_changes(settings: ReproductionSettings) -> Made:
     }
     rows = [(row["claim"], row["change"], numbers[row["result"]]) for row in paper_texts()["changes"]]
     note = "As stated -> with the change. Mean harm in m²/s²; shares and counts are of worlds."
-    return Made(sheets=[Sheet("Claims and changes", ("Claim", "Change", "Numbers"), rows, note)], notes=[WHO_DRIVES])
+    return Made(sheets=[Sheet("Claims and changes", ("Claim", "Change", "Numbers"), rows, note)], notes=[DRIVERS])
 
 
 def not_lower(outcomes: Mapping[str, RandomOutcome], policy: str, ending: str, baseline: str) -> int:

@@ -14,7 +14,7 @@ from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import curves_figure
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.learning import RANDOM, courses_of, judge_trained, unconverged_policy
-from ethbrake_marl.extensions.reproduction.made import WHO_DRIVES, DrawnFigure, Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.made import DRIVERS, DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,
     NON_E,
@@ -141,7 +141,7 @@ def reproduce_distance(settings: ReproductionSettings) -> Made:
     """Fig. 4: harm of each strategy over the sum of both gaps at the alert, and the paper's statements about it."""
     readings = distances(settings, SHIPPED_SPECS)
     groups = readings["as stated"]
-    stated, nearest = ({**statements(lines), **statements(lines, EXPECTED)} for lines in readings.values())
+    stated, nearest = (statements(lines) | statements(lines, EXPECTED) for lines in readings.values())
     claims = [judge(name, parts, nearest[name]) for name, parts in stated.items()]
     claims += [judge("Non-E grows", *(growth_between_groups(lines, NON_E) for lines in readings.values()))]
     distance_reading, episodes = STATED._replace(base=DISTANCE), min(DISTANCE_WORLDS, settings.episodes)
@@ -151,7 +151,7 @@ def reproduce_distance(settings: ReproductionSettings) -> Made:
         readings[PAPERS] = by_distance(distance_reading, episodes, lines)
         claims += process_claims(settings, readings[PAPERS], [E_V2X_BM])
     result = over_distance("harm-distance", readings, [NON_E, E_V2X_BM, COUPLED, *SHIPPED_SPECS, EXPECTED, PROVEN])
-    return result._replace(claims=claims, notes=[WHO_DRIVES])
+    return result._replace(claims=claims, notes=[DRIVERS])
 
 
 def statements(groups: Groups, baseline: str = E_V2X_BM) -> dict[str, list[Less]]:
@@ -220,7 +220,7 @@ def avoidance_by_distance(groups: Groups, policy: str) -> Claim:
         distance: [lines[name][rows] > 0.0 for name in (policy, E_V2X_BM)] for distance, (lines, rows) in groups.items()
     }
     changed = {distance: pair for distance, pair in collided.items() if (pair[0] != pair[1]).any()}
-    gains = (Less.of_worlds(distance, 1.0 * own, 1.0 * baseline) for distance, (own, baseline) in changed.items())
+    gains = (Less.of_worlds(distance, *(1.0 * rows for rows in pair)) for distance, pair in changed.items())
     most = sorted(gains, key=lambda gain: gain.difference.ends[1])[:1]
     text = "; ".join(f"{distance} {avoided_text(*pair)}" for distance, pair in collided.items())
     return judge(f"{policy} avoids collisions", most, numbers=text)
@@ -274,7 +274,7 @@ def reproduce_delays(settings: ReproductionSettings) -> Made:
         claims += process_claims(settings, trained, [NON_E, E_V2X_BM])
     legend = [NON_E, E_V2X_BM, COUPLED, *SHIPPED_SPECS, EXPECTED, PROVEN]
     result = show_harm("harm-delays", "Gaps of 7 m, speeds of 20, 18 and 20 m/s", readings, legend, "Delay")
-    return result._replace(claims=claims, notes=[f"One world: no intervals. {WHO_DRIVES}"])
+    return result._replace(claims=claims, notes=[f"One world: no intervals. {DRIVERS}"])
 
 
 def robustness_claim(groups: Groups) -> Claim:
@@ -290,9 +290,9 @@ def robustness_claim(groups: Groups) -> Claim:
 
 
 def room_claim(settings: ReproductionSettings) -> Claim:
-    """A longer delay makes more harm certain from the start. Does it leave less room for learning?
+    """Harm that is certain from the start, at a low and a high delay.
 
-    That is "undecided": as a share of the harm of Non-E it does, in m2/s2 it leaves more.
+    The verdict is always "undecided": at the high delay the room for learning is less as a share, and more in m2/s2.
     """
     episodes, shares = min(ROOM_WORLDS, settings.episodes), []
     for delay in ("low", "high"):

@@ -114,8 +114,8 @@ def choose_items(names: Sequence[str]) -> list[Item]:
 
 
 def groups_of(settings: ReproductionSettings, items: Sequence[Item]) -> list[str]:
-    training_groups = [name for item in items for name in item.trained if settings.full or name == STOPPED]
-    return list(dict.fromkeys(training_groups))
+    every = (name for item in items for name in item.trained)
+    return [name for name in dict.fromkeys(every) if settings.full or name == STOPPED]
 
 
 def cost(settings: ReproductionSettings, items: Sequence[Item]) -> str:

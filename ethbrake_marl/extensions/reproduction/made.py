@@ -15,7 +15,7 @@ from ethbrake_marl.progress import OnProgress
 
 PAPER_EPISODES = 10_000
 
-WHO_DRIVES = "PPO and SAC are the shipped policies, trained on paper-random at 0.5 and 0.8 s; they are not the paper's."
+DRIVERS = "PPO and SAC are the shipped policies, trained on paper-random at 0.5 and 0.8 s; they are not the paper's."
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
-from ethbrake_marl.extensions.reproduction.made import WHO_DRIVES, Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.made import DRIVERS, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import PAPER_ROWS, RandomTable, table_of
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.verdicts import PERCENT
@@ -80,9 +80,9 @@ GAPS = (
     Gap("seeds of the training", "multiple training tests with different random seeds", "0 to 4",
         otherwise="--full trains five, and three for each learning curve"),
     Gap("delays of the learning curves and of Fig:harm-delay", "captions: high, low; our source has no figures",
-        "0.1, 0.3 s; 0.3, 0.6 s; 0.8, 1.2 s", otherwise="not measured: other delays need other trainings"),
+        "0.1, 0.3 s; 0.3, 0.6 s; 0.8, 1.2 s", otherwise="not measured: learning curves need other trainings"),
     Gap("where the training for Table:hybrid stopped", "before convergence occurred", "a fifteenth of the recipe ppo",
-        otherwise="not measured: any harm and collision rate between those of no and of full training is possible"),
+        otherwise="not measured: one stop only"),
     Gap("ends of the cosine, number of decisions", "table:params: cosine, no numbers", "3e-4 to 3e-5; in the recipes",
         otherwise="not measured: one training each takes minutes; docs/train.md has recipes"),
 )  # fmt: skip
@@ -125,7 +125,7 @@ def reproduce_gaps(settings: ReproductionSettings) -> Made:
     collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in PAPER_ROWS]
     note = (
         f"{episodes:,} worlds. Distance: root mean square of ours / printed - 1 over the eight numbers. Then mean harm"
-        f" (m²/s²) with its 95 % interval, and the collision rate. {WHO_DRIVES} They are not trained anew for"
+        f" (m²/s²) with its 95 % interval, and the collision rate. {DRIVERS} They are not trained anew for"
         " an alternative."
     )
     far = replace(PERCENT, heading="Distance")

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style
-from ethbrake_marl.extensions.reproduction.learning import process
-from ethbrake_marl.extensions.reproduction.made import WHO_DRIVES, DrawnFigure, Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.learning import RANDOM, courses_of, process
+from ethbrake_marl.extensions.reproduction.made import DRIVERS, DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.strategies import PAPERS
@@ -24,6 +24,7 @@ from ethbrake_marl.names import open_game, teams_of
 PAPER_SCENARIOS = (1, 2)
 ARROW_S = 1.0  # between arrows: ten steps, as in the paper
 VEHICLE_2_COLUMN = 1  # column of arrays
+HOLDS = {True: "holds", False: "does not hold"}
 
 Records = Mapping[tuple[str, int], EpisodeRecord]  # (PPO or SAC, number of the scenario) -> episode
 
@@ -81,14 +82,16 @@ def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
 def all_records(settings: ReproductionSettings) -> dict[str, Records]:
     """Recorded episodes, reading -> (policy, scenario number) -> episode.
 
-    Two readings: the paper's parameters as stated, and the interpretation of the paper whose results come nearest to
-    the printed ones. If all policies were trained by the paper's process, also ``paper's process``: the first seed of
-    each.
+    Two readings: the paper's parameters as stated, and the time at which Vehicle 2 acts in the interpretation of the
+    paper whose results come nearest to the printed ones. Then, for each seed of which the paper's process has trained
+    all policies, that process. Impacts are exact in all of them.
     """
-    policies = tuple(SHIPPED_SPECS.items())
+    policies, trained = tuple(SHIPPED_SPECS.items()), process(settings)
     records = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
-    trained = tuple((name, specs[0]) for name, specs in process(settings).items())
-    return records | ({PAPERS: record_all(STATED, trained)} if len(trained) == len(policies) else {})
+    if [*trained] == [*SHIPPED_SPECS]:
+        for number, specs in enumerate(zip(*trained.values(), strict=False), 1):
+            records[f"{PAPERS} {number}"] = record_all(STATED, tuple(zip(trained, specs, strict=True)))
+    return records
 
 
 def reproduce_trajectories(settings: ReproductionSettings) -> Made:
@@ -116,7 +119,7 @@ def reproduce_trajectories(settings: ReproductionSettings) -> Made:
                 ),
             }
         )  # fmt: skip
-    return Made(claims_of(parts), figures=figures, notes=[WHO_DRIVES])
+    return Made(claims_of(parts, settings), figures=figures, notes=[DRIVERS])
 
 
 def reproduce_accelerations(settings: ReproductionSettings) -> Made:
@@ -160,7 +163,7 @@ def reproduce_accelerations(settings: ReproductionSettings) -> Made:
     )
     note = "Commands of Vehicle 2 in m/s². One world each: no intervals."
     sheet = Sheet("Commands of Vehicle 2", ("Reading", "Scenario", "Policy", *numbers), rows, note)
-    return Made(claims_of(parts), [sheet], [figure])
+    return Made(claims_of(parts, settings), [sheet], [figure])
 
 
 def resample_pair(records: Records, number: int, what: str, column: int) -> list[Floats]:
@@ -183,21 +186,21 @@ def policy_difference(records: Records, number: int, what: str) -> float:
     return float(np.sqrt(np.mean((ppo - sac) * (ppo - sac))))
 
 
-def claims_of(readings: Sequence[Mapping[str, tuple[str, float]]]) -> list[Claim]:
+def claims_of(readings: Sequence[Mapping[str, tuple[str, float]]], settings: ReproductionSettings) -> list[Claim]:
     """Verdicts on claims of the paper that one quantity is smaller than another in a single world.
 
-    A claim agrees, or differs, if the shipped policies and those of the paper's process say so, and else is undecided.
-    ``readings``: results with the parameters as stated, in the nearest reading and, if it was trained, of the paper's
-    process. Each maps a claim to numbers in words, and to the smaller quantity minus the larger one.
+    A claim agrees, or differs, if the shipped policies and all those of the paper's process say so, and else is
+    undecided. ``readings``: results with the parameters as stated, in the nearest reading and for each seed of the
+    paper's process. Each maps a claim to numbers in words, and to the smaller quantity minus the larger one.
     """
-    claims, texts = [], {True: "holds", False: "does not hold"}
-    verdicts: dict[bool, Verdict] = {True: "agrees", False: "differs"}
-    for name in readings[0]:
-        stated, nearest, *process = (reading[name] for reading in readings)
-        holds = [value < 0.0 for _, value in (stated, *process)]
-        words = (f"{texts[value]}: {words}" for value, (words, _) in zip(holds, (stated, *process), strict=True))
-        verdict = verdicts[holds[0]] if holds[1:] == holds[:1] else "undecided"
-        claims.append(Claim(name, "; by the paper's process it ".join(words), texts[nearest[1] < 0.0], verdict))
+    courses, claims = courses_of(settings, RANDOM), []
+    decided = all(course.is_converged and course.has_interval for course in courses.values())
+    for name, (numbers, stated) in readings[0].items():
+        ours, nearest, *trained = (HOLDS[reading[name][1] < 0.0] for reading in readings)
+        seeds = "".join(f"; by the paper's process, seed {seed}: {holds}" for seed, holds in enumerate(trained))
+        same: Verdict = "agrees" if stated < 0.0 else "differs"
+        verdict = same if decided and {*trained} == {ours} else "undecided"
+        claims.append(Claim(name, f"{ours}: {numbers}{seeds}", nearest, verdict))
     return claims
 
 

@@ -251,7 +251,7 @@ def test_random_table__has_every_printed_number_and_the_papers_process() -> None
     assert [row[0] for row in in_map.rows] == ["0.1 s", "0.2 s", "0.25 s", "0.3 s"]
     collides = map_bound.collides_in_map(STATED._replace(step_s=0.2), 100)
     assert in_map.rows[1][1].value == pytest.approx(collides.mean())  # as many worlds as in the list
-    length = "2 of 5 seeds, 9,000 decisions, 7 CPU-s, last third +0.0 % of the rise"
+    length = "2 of 5 seeds, 9,000 decisions, 7 CPU-s, last third +0.00 of a rise of 3.0"
     assert claims["PPO by the process"][0].endswith(f"(PPO: {length})") and f"SAC: {length}." in process.note
     rate = claims["Non-E, collision rate"]
     assert rate == ("80.0 % [71.1, 86.7]", "96.0 % [90.2, 98.4], undecided", "differs")
@@ -408,14 +408,22 @@ def test_trajectories_and_accelerations__have_these_numbers() -> None:
     }  # fmt: skip
 
 
-def test_shapes__need_our_policies_and_the_papers_process() -> None:
-    stated, nearest = {"x": ("1 m", -1.0)}, {"x": ("", 1.0)}
-    (alone,) = trajectories.claims_of([stated, nearest])
-    assert alone == Claim("x", "holds: 1 m", "does not hold", "undecided")
-    (both,) = trajectories.claims_of([stated, nearest, {"x": ("2 m", -2.0)}])
-    assert both == Claim("x", "holds: 1 m; by the paper's process it holds: 2 m", "does not hold", "agrees")
-    assert trajectories.claims_of([stated, nearest, {"x": ("2 m", 2.0)}])[0].verdict == "undecided"
-    assert trajectories.claims_of([nearest, stated, {"x": ("2 m", 2.0)}])[0].verdict == "differs"
+def test_shapes__need_our_policies_and_all_seeds_of_the_papers_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    calm = Course([{k: -9.0 + min(k, 3) for k in range(9)}] * 2, [{100.0: 1.0}] * 2, planned_seeds=2)
+    monkeypatch.setattr(trajectories, "courses_of", lambda settings, group: {"PPO": calm})
+
+    def verdict(*values: float) -> Claim:
+        return trajectories.claims_of([{"x": ("1 m", value)} for value in values], SETTINGS)[0]
+
+    assert verdict(-1.0, 1.0) == Claim("x", "holds: 1 m", "does not hold", "undecided")
+    seeds = "by the paper's process, seed 0: holds; by the paper's process, seed 1: holds"
+    assert verdict(-1.0, 1.0, -2.0, -3.0) == Claim("x", f"holds: 1 m; {seeds}", "does not hold", "agrees")
+    assert verdict(-1.0, 1.0, -2.0, 3.0).verdict == verdict(1.0, 1.0, -2.0, -3.0).verdict == "undecided"
+    assert verdict(1.0, -1.0, 2.0, 3.0).verdict == "differs"
+    still = calm._replace(returns=[{k: -9.0 + k for k in range(9)}] * 2)
+    for course in (still, calm._replace(returns=calm.returns[:1])):
+        monkeypatch.setattr(trajectories, "courses_of", lambda settings, group, course=course: {"PPO": course})
+        assert verdict(-1.0, 1.0, -2.0, -3.0).verdict == "undecided"
 
 
 def test_figures__of_positions_and_commands_are_those_of_the_records() -> None:
