@@ -57,7 +57,10 @@ def reproduce_changes(settings: ReproductionSettings) -> Made:
         "baseline": f"{stated[E_V2X_BM]['first'].mean():.2f} -> {stated[E_V2X_BM][PREDICTED].mean():.2f}",
         "short gaps": f"{NON_E} {lines[NON_E][shortest].mean():.2f}, {E_V2X_BM}"
         f" {lines[E_V2X_BM][shortest].mean():.2f} -> {lines[COUPLED][shortest].mean():.2f}",
-        "braking": " -> ".join(rate_and_harm(outcomes, NON_E) for outcomes in (stated, early)),
+        "braking": " -> ".join(
+            f"{NON_E} {100.0 * outcomes[NON_E]['collided'].mean():.1f} % and {outcomes[NON_E]['first'].mean():.2f}"
+            for outcomes in (stated, early)
+        ),
         "least": "least possible "
         + " -> ".join(
             f"{100.0 * (least > 0.0).mean():.1f} % and {least.mean():.2f}"
@@ -74,7 +77,3 @@ def not_lower(outcomes: Mapping[str, RandomOutcome], policy: str, ending: str, b
     """Number of worlds in which the hybrid does more harm than the better of its two strategies."""
     lower = np.minimum(outcomes[policy]["first"], outcomes[baseline]["first"])
     return int(np.count_nonzero(outcomes[f"Hybrid {policy}{ending}"]["first"] > lower + ROUNDING))
-
-
-def rate_and_harm(outcomes: Mapping[str, RandomOutcome], name: str) -> str:
-    return f"{name} {100.0 * outcomes[name]['collided'].mean():.1f} % and {outcomes[name]['first'].mean():.2f}"

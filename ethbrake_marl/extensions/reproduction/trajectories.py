@@ -197,7 +197,7 @@ def claims_of(readings: Sequence[Mapping[str, tuple[str, float]]], settings: Rep
     decided = all(course.is_converged and course.has_interval for course in courses.values())
     for name, (numbers, stated) in readings[0].items():
         ours, nearest, *trained = (HOLDS[reading[name][1] < 0.0] for reading in readings)
-        seeds = "".join(f"; by the paper's process, seed {seed}: {holds}" for seed, holds in enumerate(trained))
+        seeds = f"; by the paper's process, by seed: {', '.join(trained)}" if trained else ""
         same: Verdict = "agrees" if stated < 0.0 else "differs"
         verdict = same if decided and {*trained} == {ours} else "undecided"
         claims.append(Claim(name, f"{ours}: {numbers}{seeds}", nearest, verdict))

@@ -23,8 +23,8 @@ def test_cost__counts_the_trainings_that_are_missing(ethbrake: Command, empty_fo
     quick = ethbrake("reproduce", "hybrid-table", "learning-low", "--cost").err
     assert "to do: 2 items, at most about 6 s of one core; trainings before them about 0.1 min" in quick
     full = ethbrake("reproduce", "hybrid-table", "learning-low", "gaps", "--full", "--cost").err
-    # trainings: 2 x 3 x (280 + 300) s, 280 s without a terminal reward, and 6 s
-    assert "3 items, at most about 18 s of one core; trainings before them about 62.8 min" in full
+    # trainings: 2 x 3 x (280 + 300) s, 2 x 280 s without a terminal reward, and 6 s
+    assert "3 items, at most about 18 s of one core; trainings before them about 67.4 min" in full
     assert "about 58.0 min" in ethbrake("reproduce", "learning-high", "--full", "--cost").err
     assert "about 348.3 min" in ethbrake("reproduce", "trajectories", "--full", "--cost").err
     assert "trainings" not in ethbrake("reproduce", "gaps", "trajectories", "--cost").err

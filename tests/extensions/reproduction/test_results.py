@@ -416,7 +416,7 @@ def test_shapes__need_our_policies_and_all_seeds_of_the_papers_process(monkeypat
         return trajectories.claims_of([{"x": ("1 m", value)} for value in values], SETTINGS)[0]
 
     assert verdict(-1.0, 1.0) == Claim("x", "holds: 1 m", "does not hold", "undecided")
-    seeds = "by the paper's process, seed 0: holds; by the paper's process, seed 1: holds"
+    seeds = "by the paper's process, by seed: holds, holds"
     assert verdict(-1.0, 1.0, -2.0, -3.0) == Claim("x", f"holds: 1 m; {seeds}", "does not hold", "agrees")
     assert verdict(-1.0, 1.0, -2.0, 3.0).verdict == verdict(1.0, 1.0, -2.0, -3.0).verdict == "undecided"
     assert verdict(1.0, -1.0, 2.0, 3.0).verdict == "differs"
