@@ -386,7 +386,7 @@ def reward_claims(sparse: Course, dense: Mapping[str, Course]) -> list[Claim]:
     unrest = [curve.unrest / curve.rise for curve in both.values()]
     shares = " with it, ".join(f"{100.0 * share.mean():.1f} %" for share in unrest)
     harms = " with it, ".join(f"{curve.last_harm.mean():.2f}" for curve in both.values())
-    calmer = [Less.of_lists("", unrest[1], unrest[0])]
+    calmer = [Less.of_lists("", unrest[1], 0.5 * unrest[0])]  # without it, less than half of the deviation
     safer = [Less.of_lists("", sparse.last_harm, course.last_harm)]
     return [
         judge_trained("sparse", both, calmer, numbers=f"deviation in the last quarter {shares} of the rise without"),
