@@ -30,6 +30,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 RANDOM, HIGH, LOW, STOPPED, DENSE = "random", "high", "low", "stopped", "dense"
 STATUS = "run.json"  # file with the status of a run
+FEWEST_RETURNS = 3  # of a learning curve: it has a middle and a last third
 
 
 class TrainingPlan(NamedTuple):
@@ -256,10 +257,18 @@ def column(run: Path, name: str) -> dict[float, float]:
 
 
 def course_of(runs: Sequence[Path], planned_seeds: int) -> Course:
-    """Learning curves of finished ``runs``, at the steps that all runs have."""
+    """Learning curves of finished ``runs``, at the steps that all runs have.
+
+    Raises ``InvalidInput`` if the runs share fewer than three steps with a return, or none with a harm.
+    """
     curves = [[column(run, name) for run in runs] for name in (RETURN, HARM)]
     seconds = [read_object(run / STATUS)["evaluations"][-1]["cpu_s"] for run in runs]
     steps = [sorted(set.intersection(*map(set, of_seeds))) for of_seeds in curves]
+    if len(steps[0]) < FEWEST_RETURNS or not steps[1]:
+        raise InvalidInput(
+            f"{runs[0].parent}: the files progress.csv of {', '.join(run.name for run in runs)} share too few steps for"
+            " a learning curve; delete the folder whose file is damaged, or use another --output"
+        )
     last = steps[1][-1]
     returns, harm = (
         [{100.0 * k / last: curve[k] for k in shared} for curve in of_seeds]
