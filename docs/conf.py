@@ -129,7 +129,7 @@ def commands() -> str:
 
 def cards() -> str:
     """Card of every shipped policy, its headings one level lower."""
-    paths = sorted((ROOT / "ethbrake_marl" / "_policies").glob("*/card.md"))
+    paths = sorted((ROOT / "ethbrake_marl" / "shipped" / "policies").glob("*/card.md"))
     texts = [relink(path.read_text("utf-8"), "reference/policies", path.parent) for path in paths]
     return "\n\n".join(re.sub(r"(?m)^#(?=#* )", "##", text) for text in texts)
 

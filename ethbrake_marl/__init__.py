@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ethbrake_marl.doors import names_behind
+from ethbrake_marl.lazy_imports import names_behind
 from ethbrake_marl.faces.registration import register_environments
 from ethbrake_marl.errors import naming_extras
 from ethbrake_marl.renamed import new_name
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.worlds.user_worlds import read_worlds as read_worlds, worlds_from_table as worlds_from_table
 
     # The game: its state, its one step, what would happen
-    from ethbrake_marl.names import open_game as open_game
+    from ethbrake_marl.agent_names import open_game as open_game
     from ethbrake_marl.episode.game import Game as Game
     from ethbrake_marl.episode.state import State as State
     from ethbrake_marl.episode.step import Step as Step
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.episode.reward import RewardParams as RewardParams
 
     # Agents, teams and policies
-    from ethbrake_marl.names import AgentSettings as AgentSettings, make_agent as make_agent
+    from ethbrake_marl.agent_names import AgentSettings as AgentSettings, make_agent as make_agent
     from ethbrake_marl.agents.team import Agent as Agent, Team as Team, play_to_end as play_to_end, play as play
     from ethbrake_marl.agents.policy_agent import LearnedAgent as LearnedAgent, policy_agent as policy_agent
     from ethbrake_marl.policies.bundle import load_policy as load_policy, load_shipped as load_shipped
@@ -76,7 +76,7 @@ if TYPE_CHECKING:
     )
 
     # Your own parts
-    from ethbrake_marl.names import register_agent as register_agent, register_shield as register_shield
+    from ethbrake_marl.agent_names import register_agent as register_agent, register_shield as register_shield
     from ethbrake_marl.evaluation.named_measures import register_measure as register_measure
     from ethbrake_marl.episode.terms import register_term as register_term
     from ethbrake_marl.training.recipe import register_algorithm as register_algorithm

@@ -6,8 +6,8 @@ its ``pyproject.toml``:
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
 
-This package lists its own parts in tables instead, the ``parts.py`` of the core and of each extension. When a name is
-first used, the entry point is loaded and its value is passed to the ``register_...`` function.
+This package lists its own contents in tables instead, the ``contents.py`` of the core and of each extension. When a
+name is first used, the entry point is loaded and its value is passed to the ``register_...`` function.
 """
 
 from __future__ import annotations
@@ -69,13 +69,13 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def package_points(group: str) -> list[EntryPoint]:
-    """Entry points of a group that this package itself defines, in the files ``parts.py`` of core and extensions."""
+    """Entry points of a group that this package itself defines, in the files ``contents.py`` of core and extensions."""
     package = __name__.rpartition(".")[0]
     folder = files(package) / "extensions"
-    extensions = [path.name for path in folder.iterdir() if (path / "parts.py").is_file()] if folder.is_dir() else []
+    extensions = [path.name for path in folder.iterdir() if (path / "contents.py").is_file()] if folder.is_dir() else []
     part_points = []
     for place in (package, *(f"{package}.extensions.{name}" for name in extensions)):
-        table = import_module(f"{place}.parts").PARTS.get(group, {})
+        table = import_module(f"{place}.contents").CONTENTS.get(group, {})
         part_points += [EntryPoint(name, f"{place}.{value}", group) for name, value in table.items()]
     return part_points
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl import kernel_store
+from ethbrake_marl import kernel_cache
 from ethbrake_marl.files import store
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.worlds.scenario_file import new_scenario_text
@@ -74,16 +74,16 @@ def test_stored_code__that_another_process_reads_stays_without_a_warning(
 ) -> None:
     """Windows refuses to replace a file that is open."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(kernel_store, "_warned", [])
-    kernel_store.save_data("a", b"code")
+    monkeypatch.setattr(kernel_cache, "_warned", [])
+    kernel_cache.save_data("a", b"code")
 
     def refuse(source: object, target: object) -> None:
         raise PermissionError(13, "The process cannot access the file", str(target))
 
     monkeypatch.setattr(store.os, "replace", refuse)
-    kernel_store.save_data("a", b"code")
-    assert not recwarn.list and kernel_store.load_data("a", bytes) == b"code"
-    kernel_store.save_data("b", b"code")
+    kernel_cache.save_data("a", b"code")
+    assert not recwarn.list and kernel_cache.load_data("a", bytes) == b"code"
+    kernel_cache.save_data("b", b"code")
     assert "every process compiles the physics again" in str(recwarn.pop().message)
 
 

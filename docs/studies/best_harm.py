@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.agent_names import make_teams, open_game
 from ethbrake_marl.episode.counts import COUNTS, HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
@@ -35,7 +36,6 @@ from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_target
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.names import make_teams, open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.scenario import Scenario
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from PIL import Image
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.extensions.rendering.film import FPS, LAST_S, ROAD, film_scenes
 from ethbrake_marl.extensions.rendering.picture import picture
-from ethbrake_marl.names import teams_of
 
 EVERY = 2  # scenes from one picture to the next
 COLOURS = 32

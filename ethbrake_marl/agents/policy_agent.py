@@ -36,7 +36,7 @@ from ethbrake_marl.policies.manifest import PHYSICS_KEY
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.training_range import TrainingRange
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import AnyScenario, views_of
+from ethbrake_marl.worlds.open_game import AnyScenario, views_of
 from ethbrake_marl.worlds.scenario import Scenario
 
 

@@ -24,7 +24,7 @@ def agent_list(as_json: JsonOption = False) -> None:
     A name that begins with + is appended to the name of an agent, as in full_brake+step.
     """
     with Out(as_json=as_json) as out:
-        from ethbrake_marl.names import group, listed_agents, why_not_listed
+        from ethbrake_marl.agent_names import group, listed_agents, why_not_listed
 
         entries = listed_agents()
         out.result(
@@ -51,9 +51,9 @@ def agent_show(
     The table has the range of what the policy observed there, without the outermost 0.1 % at each end.
     """
     with Out(as_json=as_json) as out:
+        from ethbrake_marl.agent_names import make_agent
         from ethbrake_marl.agents.policy_agent import LearnedAgent
         from ethbrake_marl.evaluation.door import evaluate
-        from ethbrake_marl.names import make_agent
 
         agent = make_agent(name, scenario=scenario)
         if not isinstance(agent, LearnedAgent):

@@ -19,7 +19,7 @@ import typer
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli.command import JsonOption, Out
-from ethbrake_marl.kernel_store import UNSTORED, cache_folder, delete_damaged, obstacle
+from ethbrake_marl.kernel_cache import UNSTORED, cache_folder, delete_damaged, obstacle
 
 EXTRAS = ("train", "report", "marl", "export", "data", "render", "cluster", "tune", "cuda")
 
@@ -128,8 +128,8 @@ def _golden_impact() -> tuple[bool, str]:
 
     The exact harm, the square of the impact speed, is ``10^2 - 2 * 5 * 8 = 20`` m2/s2.
     """
+    from ethbrake_marl.agent_names import make_teams, open_game
     from ethbrake_marl.agents.team import play_to_end
-    from ethbrake_marl.names import make_teams, open_game
     from ethbrake_marl.worlds.user_worlds import worlds_from_state
 
     scenario, game = open_game(

@@ -102,9 +102,9 @@ def _compare(
     out: Out, scenario: str, chosen: CommandSettings, agents: str, episodes: int, seed: int, jobs: int | None, *,
     is_benchmark: bool,
 ) -> Compared:  # fmt: skip
+    from ethbrake_marl.agent_names import teams_of
     from ethbrake_marl.evaluation.benchmark import COUNT, benchmark_measures
     from ethbrake_marl.evaluation.compared import Compared
-    from ethbrake_marl.names import teams_of
 
     loaded = chosen.change_scenario(scenario)
     harm_count = chosen.command.get("harm_count", COUNT if is_benchmark else "first")

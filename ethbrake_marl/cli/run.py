@@ -57,9 +57,9 @@ def experiment_command(
     free. Ctrl-C ends the training early and evaluates the policy trained so far; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_TRAINING) as out:
+        from ethbrake_marl.agent_names import require_learner
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.episode.counts import IN_WORDS
-        from ethbrake_marl.names import require_learner
         from ethbrake_marl.training.recipe import load_recipe
         from ethbrake_marl.training.training import check_new_run
 

@@ -12,7 +12,7 @@ from ethbrake_marl.evaluation.summary import SummaryTable
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.registry import DISTRIBUTION
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, load_scenario
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.scenario import Scenario
 
 BENCHMARK = "benchmark"  # group of scenarios, the tasks

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from ethbrake_marl.agent_names import open_game, require_learner, teams_of
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.evaluation.evaluate import Result, evaluate_teams as evaluate_teams
 from ethbrake_marl.evaluation.identity import about_scenario
 from ethbrake_marl.evaluation.named_measures import measures_called
-from ethbrake_marl.names import open_game, require_learner, teams_of
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.sampling import DrawnWorlds
 
 EPISODES, SEED = 10_000, 7  # the evaluation list

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agent_names import AGENTS, make_agent, open_game, team_of
 from ethbrake_marl.agents.team import play_to_end
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.names import AGENTS, make_agent, open_game, team_of
 from ethbrake_marl.worlds.sampling import DrawnWorlds
 from ethbrake_marl.worlds.scenario import Scenario
 

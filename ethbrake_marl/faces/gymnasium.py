@@ -10,6 +10,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import steps_to_horizon
@@ -18,8 +19,7 @@ from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import Metadata
 from ethbrake_marl.faces.spaces import action_space, checked_actions, feature_box, reward_box
 from ethbrake_marl.faces.stream import chosen_seed
-from ethbrake_marl.names import open_game
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.scenario import plain
 
 

@@ -12,6 +12,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import ENDED, State
@@ -22,8 +23,7 @@ from ethbrake_marl.faces.rendering import Metadata
 from ethbrake_marl.faces.spaces import action_space, checked_actions, feature_box, reward_box
 from ethbrake_marl.faces.stream import chosen_seed
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.names import open_game
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 
 Infos = dict[str, dict[str, Any]]
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.game import Game
@@ -21,8 +22,7 @@ from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.spaces import action_space, checked_actions, feature_box
 from ethbrake_marl.faces.stream import chosen_seed
 from ethbrake_marl.motion.layout import Bools
-from ethbrake_marl.names import open_game
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.scenario import Scenario
 
 Appended = Literal["number", "state"]

@@ -7,16 +7,16 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+from ethbrake_marl.agent_names import AgentSettings, team_of, teams_of, wrap_team
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import make_renderer
-from ethbrake_marl.names import AgentSettings, team_of, teams_of, wrap_team
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.scenario import Scenario
 
 NO_TEAM = Team("", {})  # proposes nothing

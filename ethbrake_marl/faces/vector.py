@@ -19,7 +19,7 @@ from ethbrake_marl.faces.rendering import render_metadata
 from ethbrake_marl.faces.spaces import checked_actions
 from ethbrake_marl.faces.stream import Stream
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 
 
 class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):

@@ -31,8 +31,8 @@ from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.serialize import dumps
 
-from ethbrake_marl.kernel_store import announce_compilation, load_data, save_data
-from ethbrake_marl.stopping import Postponed
+from ethbrake_marl.interrupts import Postponed
+from ethbrake_marl.kernel_cache import announce_compilation, load_data, save_data
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

@@ -15,7 +15,9 @@ from ethbrake_marl.policies.manifest import Manifest, content_sha256
 from ethbrake_marl.policies.policy import MANIFEST, WEIGHTS, Policy, checked_tensors
 
 LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}  # largest sizes of the files of a bundle
-POLICY_FOLDER = Path(__file__).resolve().parents[1] / "_policies"  # NAME/policy is a bundle, NAME/card.md describes it
+POLICY_FOLDER = (
+    Path(__file__).resolve().parents[1] / "shipped" / "policies"
+)  # NAME/policy is a bundle, NAME/card.md describes it
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:

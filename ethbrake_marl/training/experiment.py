@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import InvalidInput
@@ -15,7 +16,6 @@ from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.door import EPISODES, SEED, evaluate
 from ethbrake_marl.evaluation.named_measures import MEASURES
 from ethbrake_marl.evaluation.results import RESULTS, write_results
-from ethbrake_marl.names import teams_of
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.training.run import RunFolder

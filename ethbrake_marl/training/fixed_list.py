@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import CHUNK, Agent, Team, play_to_end
@@ -15,7 +16,6 @@ from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.training.training import Training
 

@@ -15,15 +15,15 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
 from ethbrake_marl.files.plain import read_object
-from ethbrake_marl.names import open_game
+from ethbrake_marl.interrupts import stop_on_signal
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.progress import Progress, ProgressOption
 from ethbrake_marl.registry import versions_used
-from ethbrake_marl.stopping import stop_on_signal
 from ethbrake_marl.training import checkpoint
 from ethbrake_marl.training.fixed_list import Policies, PolicyMeasure, measure_on_list
 from ethbrake_marl.training.lines import LinesVecEnv
@@ -31,7 +31,7 @@ from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, algorithm_of
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.training import Training, check_new_run
 from ethbrake_marl.training.updates import BetweenUpdates, Stopped, check_finite_model
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 
 APPENDED: dict[Scheme, Any] = {"independent": "number", "centralised": "state"}
 _ONE_TRAINING = threading.Lock()

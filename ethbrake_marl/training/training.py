@@ -9,16 +9,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ethbrake_marl.agent_names import check_path
 from ethbrake_marl.episode.objectives import OBJECTIVES, objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.names import check_path
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.training.recipe import ALGORITHMS, Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import AnyScenario, views_of
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
+from ethbrake_marl.worlds.open_game import AnyScenario, views_of
 from ethbrake_marl.worlds.scenario import Scenario
 
 STATUS_FILE = "run.json"  # in the folder of a run

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.team import Team, play
 from ethbrake_marl.episode.observe import Observations
-from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.training_range import TrainingRange
 from ethbrake_marl.training.fixed_list import Policies
 from ethbrake_marl.training.training import Training
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 
 MOST_WORLDS = 1_000  # of the fixed list that are driven
 

@@ -18,7 +18,7 @@ from ethbrake_marl.files.model import suggestion
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.derived import mistakes, obstacle_gap, world_values
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.quantities import OPTIONAL, QUANTITIES, USUAL, QuantityEntry, table_columns
 from ethbrake_marl.worlds.sampling import state_of
 from ethbrake_marl.worlds.scenario import Scenario

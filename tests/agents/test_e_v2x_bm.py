@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import make_agent, open_game
 from ethbrake_marl.agents import e_v2x_bm
 from ethbrake_marl.agents.e_v2x_bm import coupled, harms
 from ethbrake_marl.agents.pairwise import CLOSED_FORM_CANDIDATES, find_candidates, harm_of_deceleration, meet, pairwise
@@ -16,7 +17,6 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import at_alert, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.layout import BRAKING, LATENCY, SPEED, Floats
-from ethbrake_marl.names import make_agent, open_game
 from tests.motion.lines import lines
 
 PAPER = {

@@ -21,6 +21,7 @@ from gymnasium.spaces import Box, Discrete
 from stable_baselines3.common import vec_env
 from stable_baselines3.common.monitor import Monitor
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.policy_agent import LearnedAgent, policy_agent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Agent, Team, play_to_end
@@ -33,7 +34,6 @@ from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
-from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.policies.training_range import TrainingRange
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import make_agent, open_game, register_agent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Team, play, play_to_end, propose
 from ethbrake_marl.episode.state import State
@@ -16,7 +17,6 @@ from ethbrake_marl.evaluation.door import evaluate
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.shield import shield
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.names import make_agent, open_game, register_agent
 from ethbrake_marl.shields.step import StepShield
 from tests.refused import refused
 

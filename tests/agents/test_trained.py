@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl import policies
+from ethbrake_marl.agent_names import make_agent, open_game
 from ethbrake_marl.agents.team import play_to_end
-from ethbrake_marl.names import make_agent, open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from tests.refused import refused
 
-SHIPPED = Path(policies.__file__).parents[1] / "_policies" / "ppo"
+SHIPPED = Path(policies.__file__).parents[1] / "shipped" / "policies" / "ppo"
 
 
 def test_policy__drives_by_the_name_of_its_algorithm(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from unittest.mock import Mock
 import pytest
 import typer
 
-from ethbrake_marl import __version__, kernel_store
+from ethbrake_marl import __version__, kernel_cache
 from ethbrake_marl.cli import app as frame
 from ethbrake_marl.cli.app import run_command, whole_command
 from ethbrake_marl.cli.command import Out
@@ -191,9 +191,9 @@ def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatc
 def test_compilation__is_announced_once(name: str, what: str, tmp_path, monkeypatch, capsys) -> None:
     """The line promises no stored result where none can be stored."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    announce = kernel_store.announce_compilation.__wrapped__
+    announce = kernel_cache.announce_compilation.__wrapped__
     if name:
-        kernel_store.save_data(name, b"")
+        kernel_cache.save_data(name, b"")
     announce()
     [line] = capsys.readouterr().err.splitlines()
     assert line.startswith(f"compiling {what}") and "; later processes use the stored result (in advance: " in line

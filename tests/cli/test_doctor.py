@@ -8,7 +8,7 @@ from unittest.mock import Mock
 import pytest
 
 import ethbrake_marl
-from ethbrake_marl import kernel_store
+from ethbrake_marl import kernel_cache
 from ethbrake_marl.agents import pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
@@ -36,7 +36,7 @@ def test_doctor__names_the_folders_that_are_used() -> None:
     (own,) = ethbrake_marl.__path__
     assert found("ethbrake_marl")[1] == f"{ethbrake_marl.__version__} in {own}"
     assert found("python")[1].endswith(f" at {sys.executable}")
-    assert found("kernel cache")[1] == str(kernel_store.cache_folder())
+    assert found("kernel cache")[1] == str(kernel_cache.cache_folder())
     shipped = [entry.path.parent.parent for entry in catalogue.list_scenarios() if entry.shipped]
     assert found("scenarios")[1] == f"{len(shipped)} in {shipped[0]}" and len({*shipped}) == 1
 
@@ -95,7 +95,7 @@ def test_kernel_cache__that_is_damaged_is_named_and_mended(tmp_path: Path, monke
     folder = tmp_path / "ethbrake_marl"
     assert found("kernel cache") == (True, str(folder))
     for name in "abcd":
-        kernel_store.save_data(name, name.encode())
+        kernel_cache.save_data(name, name.encode())
     (folder / "a.compiled").write_bytes(b"")
     (folder / "b.compiled").unlink()
     (folder / "b.compiled" / "inside").mkdir(parents=True)
@@ -103,12 +103,12 @@ def test_kernel_cache__that_is_damaged_is_named_and_mended(tmp_path: Path, monke
     (folder / "README").write_text("of somebody else")
     with monkeypatch.context() as patch:
         patch.setattr(Path, "unlink", Mock(side_effect=PermissionError))
-        patch.setattr(kernel_store, "TemporaryFile", Mock(side_effect=OSError(30, "Read-only file system")))
-        told = f"{folder}: Read-only file system; {kernel_store.UNSTORED}; damaged files: 3, of which 1 are deleted now"
+        patch.setattr(kernel_cache, "TemporaryFile", Mock(side_effect=OSError(30, "Read-only file system")))
+        told = f"{folder}: Read-only file system; {kernel_cache.UNSTORED}; damaged files: 3, of which 1 are deleted now"
         assert found("kernel cache") == (False, told)
     assert found("kernel cache") == (True, f"{folder}; damaged files: 2, of which 2 are deleted now")
     assert found("kernel cache") == (True, str(folder))
-    assert {path.name for path in folder.iterdir()} == {"d.compiled", "README"} and kernel_store.load_data(
+    assert {path.name for path in folder.iterdir()} == {"d.compiled", "README"} and kernel_cache.load_data(
         "d", bytes
     ) == b"d"
 
@@ -116,5 +116,5 @@ def test_kernel_cache__that_is_damaged_is_named_and_mended(tmp_path: Path, monke
 def test_compiling_ahead__without_a_folder_to_write_is_refused(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
-    told = f"{tmp_path}/file/ethbrake_marl: Not a directory; {kernel_store.UNSTORED}"
+    told = f"{tmp_path}/file/ethbrake_marl: Not a directory; {kernel_cache.UNSTORED}"
     assert doctor.compile_ahead(training=False) == (False, told)

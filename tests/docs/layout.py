@@ -73,7 +73,7 @@ def page() -> str:
             PAGE.read_text("utf-8").partition(BEGINNING.partition("\n")[0])[0] + BEGINNING,
             *table([layer for layer in core if layer]),
             "\n### Extensions\n",
-            "An extension is a folder whose table `parts.py` says what it adds; [no module of the core names",
+            "An extension is a folder whose table `contents.py` says what it adds; [no module of the core names",
             "it](decisions/README.md#the-core-never-names-an-extension). It may use the core and the extensions in",
             "the lines below it; the docstring of its folder says what it holds. To delete one, delete its folder, its",
             "folder in `tests/extensions/`, and every extension that uses it.\n",

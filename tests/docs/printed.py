@@ -18,7 +18,7 @@ PAGES = [
     *(ROOT / name for name in ("README.md", "CHANGELOG.md")),
     *sorted(ROOT.glob(".github/**/*.md")),
     *sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts),
-    *sorted((ROOT / "ethbrake_marl" / "_policies").glob("*/card.md")),
+    *sorted((ROOT / "ethbrake_marl" / "shipped" / "policies").glob("*/card.md")),
 ]
 COMPARED = "`make figures` compares the table"  # in a section with the commands
 

@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import group
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import benchmark
 from ethbrake_marl.evaluation.benchmark import benchmark_rows, evaluate_task
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.files.sheet import csv_text
-from ethbrake_marl.names import group
 from tests.docs.site import load
 from tests.fixtures.commands import Command, rows_of, told_json
 from tests.refused import refused

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.scenario import Scenario
 
 PAIR = Scenario(

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.names import open_game
 from tests.contract.interfaces import CRASH, REST
 from tests.episode.lines import later, state_of
 from tests.episode.test_terms import paid

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import make_agent, open_game
 from ethbrake_marl.episode.counts import COUNTED_ROWS, COUNTS, pair_amounts
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import hold
@@ -16,7 +17,6 @@ from ethbrake_marl.episode.reward import RewardParams, reward_params
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.door import evaluate
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, DROVE, MOVING, PUSHED
-from ethbrake_marl.names import make_agent, open_game
 from ethbrake_marl.shields.step import StepShield
 from tests.contract.interfaces import CRASH, REST
 from tests.episode.lines import later, state_of

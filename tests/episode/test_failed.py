@@ -7,13 +7,13 @@ import copy
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.layout import GAP, SPEED
-from ethbrake_marl.names import open_game
 
 N, PLANTED = 5, 3
 

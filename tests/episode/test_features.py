@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import views_of
+from ethbrake_marl.worlds.open_game import views_of
 from tests.episode.lines import later, state_of
 
 TWO_AHEAD = View(["own", "front_1", "front_2", "rear_1"])

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.objectives import amounts, objectives_of, parse_objective
 from ethbrake_marl.episode.state import State, split_harm
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout as at
-from ethbrake_marl.names import open_game
 from tests.episode.lines import later, state_of
 
 EPS = np.finfo(float).eps

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import choose, descend, hold
 from ethbrake_marl.episode.play import price
@@ -16,7 +17,6 @@ from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
-from ethbrake_marl.names import open_game
 
 N = 7
 REWARDS: dict[str, Any] = {

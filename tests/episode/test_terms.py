@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.objectives import amounts, objectives_of
@@ -19,7 +20,6 @@ from ethbrake_marl.episode.step import COST, Step
 from ethbrake_marl.episode.terms import potential, register_term
 from ethbrake_marl.errors import FreeImpacts
 from ethbrake_marl.motion.layout import BRAKING, FIRST, GAP, SPEED, TOTAL
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.contract.interfaces import CRASH, REST

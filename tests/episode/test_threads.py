@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode import threads
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.step import OUT_ROWS, step_worlds
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.layout import Floats, scratch_for
-from ethbrake_marl.names import open_game
 from tests.episode.test_failed import planted
 
 N = 203  # worlds: slices of 2, 3 and 5 threads differ in length

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.layer import SENSORS
@@ -13,7 +14,6 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.evaluate import Result, evaluate_teams
 from ethbrake_marl.evaluation.identity import about_scenario
 from ethbrake_marl.evaluation.named_measures import measures_called
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.scenario import Scenario
 
 # Two vehicles at 20 m/s, 1 m apart, brake with 6 m/s2, the rear one from 0.5 s. By hand: at 0.5 s the gap is 0.25 m and

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.e_v2x_bm import EV2XBM
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.team import Team
@@ -29,7 +30,6 @@ from ethbrake_marl.evaluation.named_measures import MEASURES, measures_called, r
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.motion.layout import GAP
-from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from ethbrake_marl.shields.step import StepShield

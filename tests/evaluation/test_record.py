@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless
 from tests.refused import refused

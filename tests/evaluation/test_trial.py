@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from ethbrake_marl.agent_names import AGENTS
 from ethbrake_marl.evaluation.trial import COMPARED, WORLDS, try_scenario
-from ethbrake_marl.names import AGENTS
 from ethbrake_marl.worlds.catalogue import load_scenario
 
 PAPER = load_scenario("paper-random")

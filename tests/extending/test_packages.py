@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import AGENTS, WRAPPERS
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.episode.features import FEATURES
 from ethbrake_marl.episode.objectives import OBJECTIVES
 from ethbrake_marl.episode.terms import TERMS
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.evaluation.named_measures import MEASURES
-from ethbrake_marl.names import AGENTS, WRAPPERS
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.training.recipe import ALGORITHMS
 

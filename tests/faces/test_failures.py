@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import register_agent
 from ethbrake_marl.episode.layer import Layer
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.faces.rendering import Renderer, register_renderer
-from ethbrake_marl.names import register_agent
 from ethbrake_marl.worlds.channel import register_v2x_extension
 from tests.contract.interfaces import BARE, PAPER, STEP, Vector, actions
 from tests.fixtures.layer import UsersExtension

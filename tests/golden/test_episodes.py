@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.motion.layout import PUSHED
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.fixtures.scenarios import SHIPPED
 

@@ -20,10 +20,10 @@ import numba
 import pytest
 from numba.core import event
 
-from ethbrake_marl import kernel_store
+from ethbrake_marl import kernel_cache
 from ethbrake_marl.errors import CacheFault
+from ethbrake_marl.interrupts import stop_on_signal
 from ethbrake_marl.motion import compiling
-from ethbrake_marl.stopping import stop_on_signal
 from tests.fixtures.kernels import OWN, give_own_cache, pytest_collection
 
 KERNELS = """\
@@ -84,7 +84,7 @@ def test_processes__begin_at_once_with_an_empty_cache(tmp_path: Path) -> None:
     assert [said for said, _ in ended] == ["42.0\n"] * 8
     assert {notice.partition(" ")[0] for _, notice in ended if notice} == {"compiling"}  # all, or what others left
     assert begin(tmp_path, tmp_path / "cache").communicate() == ("42.0\n", "")
-    assert {path.suffix for path in (tmp_path / "cache/ethbrake_marl").iterdir()} == {kernel_store.SUFFIX}
+    assert {path.suffix for path in (tmp_path / "cache/ethbrake_marl").iterdir()} == {kernel_cache.SUFFIX}
 
 
 def test_stamp__depends_on_the_kernels_beside_and_on_no_path(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Told]:
     place = importlib.util.spec_from_file_location("kernels", tmp_path / "kernels.py")
 
     def ask() -> Told:
-        monkeypatch.setattr(kernel_store, "_warned", [])
+        monkeypatch.setattr(kernel_cache, "_warned", [])
         module = importlib.util.module_from_spec(place)
         place.loader.exec_module(module)
         with warnings.catch_warnings(record=True) as warned:
@@ -167,7 +167,7 @@ def exchange(file: Path) -> None:
 
 
 def with_a_class_that_is_gone(file: Path) -> None:
-    kernel_store.save_data(file.name.removesuffix(file.suffix), b"cno_such_module\nClass\n.")
+    kernel_cache.save_data(file.name.removesuffix(file.suffix), b"cno_such_module\nClass\n.")
 
 
 DAMAGE = {
@@ -280,7 +280,7 @@ def test_cache__that_cannot_be_written(
         answer, compiled, warned = ask()
         is_used = is_full and is_readable
         assert (answer, compiled, len(warned)) == (42.0, 0 if is_used else 2, not is_used)
-        assert all(reason in text and kernel_store.UNSTORED in text for text in warned)
+        assert all(reason in text and kernel_cache.UNSTORED in text for text in warned)
         assert "None" not in "".join(warned) and {*files_in(tmp_path)} <= before
 
 
@@ -333,7 +333,7 @@ def abs_of(x: float) -> float:
 
 
 def test_suite__has_a_cache_of_its_own() -> None:
-    assert kernel_store.cache_folder().parent.name == OWN
+    assert kernel_cache.cache_folder().parent.name == OWN
 
 
 def test_suite__begins_with_the_sound_files_of_the_users_cache(ask: Callable, tmp_path: Path, monkeypatch) -> None:
@@ -345,8 +345,8 @@ def test_suite__begins_with_the_sound_files_of_the_users_cache(ask: Callable, tm
     before = {path: path.stat() for path in user.iterdir()}
     for _ in range(2):
         give_own_cache()
-        assert [path.name for path in kernel_store.cache_folder().iterdir()] == [sound.name]
-    assert kernel_store.cache_folder().parent == user.parent / OWN
+        assert [path.name for path in kernel_cache.cache_folder().iterdir()] == [sound.name]
+    assert kernel_cache.cache_folder().parent == user.parent / OWN
     assert {path: path.stat()[:-3] for path in user.iterdir()} == {path: old[:-3] for path, old in before.items()}
 
 

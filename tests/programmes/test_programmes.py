@@ -133,4 +133,4 @@ def test_bug__is_planted_in_the_copy_and_taken_out_again(tmp_path, monkeypatch) 
 
 def test_tests_near_a_file__are_those_of_its_folder() -> None:
     assert bugs.near("extensions/search/search.py") == ["tests/extensions/search"]
-    assert "tests/test_names.py" in bugs.near("names.py")
+    assert "tests/test_agent_names.py" in bugs.near("agent_names.py")

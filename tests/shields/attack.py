@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agent_names import open_game, register_agent
 from ethbrake_marl.agents.team import Team, play
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
@@ -12,7 +13,6 @@ from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.shield import shield
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, GAP, SPEED, Floats
-from ethbrake_marl.names import open_game, register_agent
 from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.scenario import Scenario

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import make_agent, open_game
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Agent, Team, play_to_end
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.names import make_agent, open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from tests.shields.attack import LINES

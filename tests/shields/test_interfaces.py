@@ -12,6 +12,7 @@ from pettingzoo.test import api_test, parallel_api_test
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import make_teams, register_shield
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Team
@@ -21,7 +22,6 @@ from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.shield import shield
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
-from ethbrake_marl.names import make_teams, register_shield
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.shield import ShieldReason
 from ethbrake_marl.shields.step import StepShield

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from ethbrake_marl.agent_names import make_agent, open_game
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Team, play_to_end
@@ -16,7 +17,6 @@ from ethbrake_marl.episode.play import follow_plans, price
 from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
-from ethbrake_marl.names import make_agent, open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.fallbacks import CHANGES, SINGLE_ACTIONS, best_constant, first_plans
 from ethbrake_marl.shields.shield import ShieldReason

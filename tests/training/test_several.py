@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import make_agent, open_game, team_of
 from ethbrake_marl.agents.team import play_to_end
-from ethbrake_marl.names import make_agent, open_game, team_of
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training import train as train_module
 from ethbrake_marl.training.recipe import algorithm_of

@@ -22,10 +22,10 @@ from stable_baselines3 import A2C
 from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from ethbrake_marl.agent_names import make_agent, open_game, team_of
 from ethbrake_marl.agents.team import play_to_end
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.motion.digest import physics_digest
-from ethbrake_marl.names import make_agent, open_game, team_of
 from ethbrake_marl.policies.bundle import load_drivers, load_policy
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.training import train as train_module

@@ -19,7 +19,7 @@ from ethbrake_marl.worlds import catalogue, sampling, scenario_file
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, load_scenario
 from ethbrake_marl.worlds.counters import uniform_numbers
 from ethbrake_marl.worlds.describe import clusters_of, columns_of, fixed_columns
-from ethbrake_marl.worlds.game import views_of
+from ethbrake_marl.worlds.open_game import views_of
 from ethbrake_marl.worlds.quantities import QUANTITIES
 from ethbrake_marl.worlds.sampling import WorldPool
 from ethbrake_marl.worlds.scenario import Scenario

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import make_teams
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.benchmark import COUNT, evaluate_task
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import check_target, write_file
-from ethbrake_marl.names import make_teams
 
 
 def cross_play(task: str, agents: Sequence[str]) -> tuple[list[str], NDArray[Any]]:

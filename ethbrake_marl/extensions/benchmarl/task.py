@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, naming_extras
@@ -19,9 +20,8 @@ from ethbrake_marl.faces.rendering import RENDERERS, make_renderer
 from ethbrake_marl.faces.shield import NO_TEAM, guard_team
 from ethbrake_marl.faces.spaces import action_space, checked_actions, feature_box
 from ethbrake_marl.faces.stream import Stream, chosen_seed
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.scenario import Scenario
 
 with naming_extras():

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from ethbrake_marl.doors import front_door
+from ethbrake_marl.lazy_imports import front_door
 
 if TYPE_CHECKING:
     from ethbrake_marl.extensions.cooperation.front import (

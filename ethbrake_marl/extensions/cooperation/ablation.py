@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agent_names import open_game, teams_of
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.counts import COLUMN
@@ -36,7 +37,6 @@ from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.extensions.studies.folder import work_in
 from ethbrake_marl.motion.layout import FAR_M, GAP, OWN_LATENCY, WEIGHT, Bools, Floats
-from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.job import Job

@@ -166,6 +166,7 @@ def front_command(
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
 
+        from ethbrake_marl.agent_names import split_specs
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.episode.counts import check_count
         from ethbrake_marl.extensions.cooperation.front import (
@@ -185,8 +186,7 @@ def front_command(
         from ethbrake_marl.extensions.report.style import picture_bytes
         from ethbrake_marl.files.store import check_folder
         from ethbrake_marl.files.yaml import parse_yaml
-        from ethbrake_marl.names import split_specs
-        from ethbrake_marl.stopping import stop_on_signal
+        from ethbrake_marl.interrupts import stop_on_signal
         from ethbrake_marl.worlds.sampling import merge_draws
 
         changes = read_settings(settings, of_command=("harm_count",))

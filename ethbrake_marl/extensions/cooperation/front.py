@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agent_names import make_teams, open_game
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.counts import COUNTS, check_count
 from ethbrake_marl.episode.game import Game
@@ -23,7 +24,6 @@ from ethbrake_marl.extensions.search.pricing import Problem, Profiles, beside_br
 from ethbrake_marl.extensions.search.search import search_profiles
 from ethbrake_marl.extensions.search.tables import best_stored
 from ethbrake_marl.motion.layout import WEIGHT, Floats, Ints
-from ethbrake_marl.names import make_teams, open_game
 from ethbrake_marl.policies.bundle import shipped_policies
 from ethbrake_marl.worlds.scenario import Scenario
 

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
@@ -29,7 +30,6 @@ from ethbrake_marl.extensions.report.style import (
 )
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.describe import clusters_of, columns_of
 from ethbrake_marl.worlds.sampling import DrawnWorlds
 from ethbrake_marl.worlds.scenario import Scenario

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ethbrake_marl.doors import front_door
+from ethbrake_marl.lazy_imports import front_door
 
 if TYPE_CHECKING:
     from ethbrake_marl.extensions.cuda.worlds import Worlds as Worlds

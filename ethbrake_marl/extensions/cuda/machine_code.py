@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.errors import naming_extras
-from ethbrake_marl.kernel_store import load_data, save_data
+from ethbrake_marl.kernel_cache import load_data, save_data
 from ethbrake_marl.motion.compiling import stamp_of
 
 NEWEST = (9, 0)  # GPUs that are newer run the code of this one

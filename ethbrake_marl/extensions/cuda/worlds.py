@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import LAST, State
 from ethbrake_marl.episode.step import FIRST_HARM, OUT_ROWS, TERMINATED, TOTAL_HARM, TRUNCATED, failure
@@ -27,8 +28,7 @@ from ethbrake_marl.extensions.cuda.kernels import (
     ViewArrays,
     memory_of,
 )
-from ethbrake_marl.names import open_game
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 
 POOL = 100_000  # worlds that are drawn by default
 WHOSE = {"harm": "harm of single vehicles"}  # otherwise the compiled step computes it

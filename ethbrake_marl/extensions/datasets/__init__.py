@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.agent_names import open_game, teams_of
 from ethbrake_marl.agents.team import Team, play
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
@@ -24,8 +25,7 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number, naming_extras
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.identity import versions
 from ethbrake_marl.files.store import check_target, new_file
-from ethbrake_marl.names import open_game, teams_of
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 
 EPISODES_AT_ONCE = 500  # number of worlds simulated together; it limits memory and has no effect on the episodes
 

@@ -10,9 +10,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from ethbrake_marl.agent_names import make_agent
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.names import make_agent
 from ethbrake_marl.policies.layers import Float32s
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.policies.policy import Policy

@@ -44,9 +44,9 @@ def watch_command(
     the hardest impact under any agent, and the end; the text shows the alert, each pair's first impact in a time step,
     and the end.
     """
+    from ethbrake_marl.agent_names import open_game, require_learner, teams_of
     from ethbrake_marl.cli.settings import read_settings
     from ethbrake_marl.extensions.rendering.film import WRITERS, check_film, films_in_words, films_of, show_in_window
-    from ethbrake_marl.names import open_game, require_learner, teams_of
 
     with Out(force=force) as out:
         in_words = output == Path("-")

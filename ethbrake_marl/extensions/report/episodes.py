@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.counts import COLUMN, HARM
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.compared import Compared
@@ -20,7 +21,6 @@ from ethbrake_marl.extensions.report.best_known import BestKnown
 from ethbrake_marl.extensions.report.page import Section, data, fill, page_part, printable_text
 from ethbrake_marl.extensions.report.style import quantities
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
-from ethbrake_marl.names import open_game
 
 DATA = "episode_data"  # id of the data in a page; no section has it
 MOTION_SAMPLE_S = 0.005  # time between two samples of the motion

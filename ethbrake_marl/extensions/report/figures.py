@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, PercentFormatter
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import harm_of_deceleration, pairwise
 from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
@@ -43,9 +44,8 @@ from ethbrake_marl.extensions.report.style import (
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import BRAKING, LATENCY, Floats
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.describe import quantities_of
-from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.quantities import QUANTITIES, Rule
 from ethbrake_marl.worlds.sampling import DrawnWorlds
 from ethbrake_marl.worlds.scenario import Scenario

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
+from ethbrake_marl.agent_names import AGENTS, WRAPPERS
 from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import caption
@@ -25,7 +26,6 @@ from ethbrake_marl.extensions.report.three_tests import SHORT_TABLE
 from ethbrake_marl.files.sheet import CellText, Column, Sheet
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Bools
-from ethbrake_marl.names import AGENTS, WRAPPERS
 
 LEARNED_AGENTS = ("trained policy", "trained team")  # names that get an article
 COUNTED_WORDS = {  # count -> verb, noun, and what is counted

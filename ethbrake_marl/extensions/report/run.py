@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.evaluation.captions import caption
@@ -34,7 +35,6 @@ from ethbrake_marl.extensions.report.style import TITLES, write_picture
 from ethbrake_marl.extensions.report.three_tests import TESTS, other_tests, short_sheet, title_of
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
-from ethbrake_marl.names import open_game
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.experiment import HYBRID, SHIELDED, TEAM, TEAM_BASELINES, Experiment, Tables, without
 from ethbrake_marl.training.run import RunFolder

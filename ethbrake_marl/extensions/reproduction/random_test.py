@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.agent_names import open_game, teams_of
 from ethbrake_marl.agents.pairwise import (
     CLOSED_FORM_CANDIDATES,
     RELATIVE_TIE,
@@ -33,7 +34,6 @@ from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.extensions.reproduction.readings import Reading
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.motion.layout import BRAKING, HIT, LATENCY, Bools, Floats
-from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.worlds.scenario import Scenario
 
 VEHICLE_2 = 2  # body

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 from matplotlib.figure import Figure
 
+from ethbrake_marl.agent_names import open_game, teams_of
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style
@@ -19,7 +20,6 @@ from ethbrake_marl.extensions.reproduction.strategies import PAPERS
 from ethbrake_marl.extensions.reproduction.verdicts import Claim, Verdict
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.names import open_game, teams_of
 
 PAPER_SCENARIOS = (1, 2)
 ARROW_S = 1.0  # between arrows: ten steps, as in the paper

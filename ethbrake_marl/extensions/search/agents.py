@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agent_names import AgentSettings, make_agent
 from ethbrake_marl.agents.team import MODEL, Agent, Team
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import FIRST_DECISION, State
@@ -17,9 +18,8 @@ from ethbrake_marl.extensions.search.pricing import Problem, problem_of, with_br
 from ethbrake_marl.extensions.search.search import refine, search_profiles
 from ethbrake_marl.extensions.search.tables import best_stored, outdated_tables
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.names import AgentSettings, make_agent
 from ethbrake_marl.registry import Part
-from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.worlds.open_game import game_of
 from ethbrake_marl.worlds.roles import HOLDING_SCRIPTS, LEARNER
 from ethbrake_marl.worlds.scenario import Scenario
 

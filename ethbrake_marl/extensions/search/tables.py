@@ -25,7 +25,7 @@ from ethbrake_marl.motion.layout import Floats
 
 TABLE_FORMAT = 2
 SIZE_LIMIT_BYTES, UNPACKED_LIMIT_BYTES = 64 << 20, 256 << 20
-TABLE_FOLDER = Path(__file__).with_name("_tables")
+TABLE_FOLDER = Path(__file__).resolve().parents[2] / "shipped" / "tables"
 ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # entries of the header that messages show
 ARRAYS = {"identity": ("<u8", 1)}  # name of an array -> its type and number of axes,
 OF_COUNT = {"harm": ("<f8", 1), "ends": ("<u2", 2), "commands": ("<f8", 3)}  # and of those of one count of harm

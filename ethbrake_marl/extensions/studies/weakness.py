@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agent_names import open_game, teams_of
 from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
@@ -14,7 +15,6 @@ from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.extensions.studies.cube import cube_of
 from ethbrake_marl.extensions.studies.falsification import far_apart, search_cube
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.worlds.describe import fixed_columns, quantities_of
 from ethbrake_marl.worlds.scenario import Scenario
 

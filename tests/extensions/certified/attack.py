@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.certified.robust import RobustShield, reset_without_shield
-from ethbrake_marl.names import open_game
 from tests.shields.attack import LINES, WAYS
 
 UNCERTAINTIES = {

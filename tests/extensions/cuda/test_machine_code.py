@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import torch
 
-from ethbrake_marl import kernel_store
+from ethbrake_marl import kernel_cache
 from ethbrake_marl.errors import CacheFault, InvalidInput, MissingExtra
 from ethbrake_marl.extensions.cuda import device, machine_code
 from ethbrake_marl.extensions.cuda.machine_code import PTX_VERSION, compile_kernel, ptx_of
@@ -115,7 +115,7 @@ def test_code__is_made_anew_when_the_threads_change(tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize("content", [b"", b"as before", b"\xff" * 100, None])
 def test_code__that_is_damaged_is_made_anew(content: bytes | None, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(kernel_store, "_warned", [])
+    monkeypatch.setattr(kernel_cache, "_warned", [])
     monkeypatch.setattr(machine_code, "compile_kernel", lambda kernel, *_: kernel)
     ptx_of("play", lambda: "compile_kernel", (), (9, 0))
     [file] = (tmp_path / "ethbrake_marl").iterdir()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import group, make_agent
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.extensions.field.controllers import LAWS, KnownMotion, Parameters, fuzzy_criteria
 from ethbrake_marl.motion.layout import GAP
-from ethbrake_marl.names import group, make_agent
 from tests.refused import refused
 
 

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.scenario import Scenario
 
 LINE = Scenario(

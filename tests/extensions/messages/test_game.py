@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.features import FEATURES, register_feature
 from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.state import State
@@ -13,9 +14,8 @@ from ethbrake_marl.extensions.messages.game import MESSAGES_LAYER
 from ethbrake_marl.extensions.messages.links import MESSAGES_KEY
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.worlds.open_game import game_of
 from tests.extensions.messages.line import LINE, played, stepped
 from tests.refused import refused
 

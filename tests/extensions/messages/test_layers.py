@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.layer import Layer
 from ethbrake_marl.motion.layout import SPEED
-from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.channel import register_preset, register_v2x_extension
 from ethbrake_marl.worlds.physics import register_physics
 from tests.contract.interfaces import PAPER

@@ -10,12 +10,12 @@ import onnx
 import onnxruntime
 import pytest
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.policy_agent import LearnedAgent, policy_agent
 from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import AgentFailed
 from ethbrake_marl.extensions.onnx import to_onnx
-from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.policy import Policy
 from tests.agents.test_policy_agent import OTHERS, PPO, actions, harms
 from tests.fixtures.commands import Refuse

@@ -9,10 +9,10 @@ import pytest
 from PIL import Image, ImageSequence
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.rendering import viewer
 from ethbrake_marl.extensions.rendering.film import WRITERS, film_scenes, films_of
-from ethbrake_marl.names import teams_of
 from tests.fixtures.commands import Command, Refuse
 from tests.programmes.figures import frames, unequal_share
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.measures import Measure
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.report.best_known import AVOIDABLE_COLUMN, BEST, UNAVOIDABLE
-from ethbrake_marl.names import teams_of
 
 AGENTS = ("full_brake", "constant:4.5", "ppo", "ppo+episode")
 

@@ -8,6 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import (
@@ -23,7 +24,6 @@ from ethbrake_marl.extensions.report.figures import (
 )
 from ethbrake_marl.extensions.report.style import label_text, new_figure, picture_bytes, series_style
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.names import teams_of
 from tests.evaluation.lines import recorded
 from tests.extensions.report.conftest import compared_by
 

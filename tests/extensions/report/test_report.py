@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import record_episodes
@@ -31,7 +32,6 @@ from ethbrake_marl.extensions.report.report import (
     worst_section,
 )
 from ethbrake_marl.extensions.report.run import learners_sheets
-from ethbrake_marl.names import teams_of
 from ethbrake_marl.training.experiment import TEAM, without
 from tests.evaluation.lines import recorded
 from tests.extensions.report.conftest import AGENTS, compared_by, with_best_known

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import open_game, teams_of
 from ethbrake_marl.agents.pairwise import harm_of_deceleration, pairwise
 from ethbrake_marl.agents.team import play_to_end
 from ethbrake_marl.errors import InvalidInput
@@ -23,7 +24,6 @@ from ethbrake_marl.extensions.reproduction.random_test import (
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, RANDOM, STATED, Reading
 from ethbrake_marl.extensions.reproduction.register import distance, rates_and_harms
 from ethbrake_marl.motion.layout import BRAKING, LATENCY
-from ethbrake_marl.names import open_game, teams_of
 from tests.refused import refused
 
 WORLDS = 100

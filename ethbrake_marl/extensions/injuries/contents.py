@@ -1,6 +1,6 @@
-"""The parts that this extension adds: group -> name -> module of this folder and object."""
+"""Contents of this extension: group -> name -> module of this folder and object."""
 
-PARTS = {
+CONTENTS = {
     "measures": {
         "injury": "measures:INJURY",
         "injury_lr4s": "measures:LR4S",

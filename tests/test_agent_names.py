@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl import names
-from ethbrake_marl.agents.team import Team, play_to_end
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
-from ethbrake_marl.names import (
+from ethbrake_marl.agent_names import (
     AgentSettings,
     group,
     listed_agents,
@@ -22,6 +20,8 @@ from ethbrake_marl.names import (
     register_shield,
     teams_of,
 )
+from ethbrake_marl.agents.team import Team, play_to_end
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.worlds.catalogue import load_scenario
 
 PAPER = load_scenario("paper-random")

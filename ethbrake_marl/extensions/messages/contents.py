@@ -1,6 +1,6 @@
-"""The parts that this extension adds: group -> name -> module of this folder and object."""
+"""Contents of this extension: group -> name -> module of this folder and object."""
 
-PARTS = {
+CONTENTS = {
     "features": {
         "age": "features:AGE",
         "intent": "features:INTENT_FEATURE",

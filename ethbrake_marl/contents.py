@@ -1,6 +1,6 @@
-"""The parts of the core: group -> name -> module and object, loaded when the name is first used."""
+"""Contents of the core: group -> name -> module and object, loaded when the name is first used."""
 
-PARTS = {
+CONTENTS = {
     "agents": {
         "coast": "agents.scripts:COAST_ENTRY",
         "full_brake": "agents.scripts:FULL_BRAKE_ENTRY",

@@ -1,6 +1,6 @@
-"""The parts that this extension adds: group -> name -> module of this folder and object."""
+"""Contents of this extension: group -> name -> module of this folder and object."""
 
-PARTS = {
+CONTENTS = {
     "agents": {"e_v2x_bm.estimated": "estimating:ESTIMATED_E_V2X_BM"},
     "shields": {
         "robust": "robust:ROBUST",

@@ -1,6 +1,6 @@
-"""The parts that this extension adds: group -> name -> module of this folder and object."""
+"""Contents of this extension: group -> name -> module of this folder and object."""
 
-PARTS = {
+CONTENTS = {
     "renderers": {"rgb_array": "viewer:Viewer", "ansi": "viewer:Words", "human": "viewer:Window"},
     "commands": {"watch": "commands:WATCH"},
 }

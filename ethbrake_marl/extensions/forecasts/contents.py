@@ -1,6 +1,6 @@
-"""The parts that this extension adds: group -> name -> module of this folder and object."""
+"""Contents of this extension: group -> name -> module of this folder and object."""
 
-PARTS = {
+CONTENTS = {
     "agents": {"plan": "plan:AGENT"},
     "feature_groups": {"contact": "contacts:NEAR_GROUP", "contact_far": "contacts:FAR_GROUP", "plan": "plan:GROUP"},
 }

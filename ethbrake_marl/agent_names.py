@@ -28,7 +28,7 @@ from ethbrake_marl.errors import EthBrakeError, InvalidInput, UnknownName, descr
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import AnyScenario, game_of
+from ethbrake_marl.worlds.open_game import AnyScenario, game_of
 from ethbrake_marl.worlds.roles import HOLDING_SCRIPTS, LEARNER, check_role
 from ethbrake_marl.worlds.scenario import Scenario
 

@@ -1,6 +1,6 @@
-"""The parts that this extension adds: group -> name -> module of this folder and object."""
+"""Contents of this extension: group -> name -> module of this folder and object."""
 
-PARTS = {
+CONTENTS = {
     "agents": {"best_harm": "agents:BEST_HARM", "ladder.search": "agents:SEARCH_LADDER"},
     "shields": {"search": "agents:SEARCH"},
     "measures": {"limits": "limits:LIMITS"},

@@ -1,0 +1,3 @@
+"""Contents of this extension: group -> name -> module of this folder and object."""
+
+CONTENTS = {"algorithm_variants": {"vine.cuda": "vine:CudaVine"}}

@@ -1,3 +1,0 @@
-"""The parts that this extension adds: group -> name -> module of this folder and object."""
-
-PARTS = {"commands": {"study": "commands:study_group"}}
