@@ -1,4 +1,4 @@
-"""Names of version 1.0 that 2.0 has changed. There are no aliases: the error for an old name says the new one.
+"""Names of earlier versions that have changed. There are no aliases: the error for an old name says the new one.
 
 The table of the changelog contains these names too.
 """
@@ -20,12 +20,13 @@ RENAMED: Mapping[str, Mapping[str, str]] = MappingProxyType(  # kind of the name
         "agent": {"universal-paper": "vine-paper"},
         "recipe": {"universal-paper": "vine-paper"},
         "shipped policy": {"universal-paper": "vine-paper"},
+        "reward": {"paper": "paper-reward"},
     }
 )
 
 
 def new_name(kind: str, name: object) -> str:
-    """Advice such as "renamed to level-0-sensors" for a name of version 1.0; "" for any other.
+    """Advice such as "renamed to level-0-sensors" for a name of an earlier version; "" for any other.
 
     ``kind``: what has the name, such as ``scenario`` (``RENAMED``).
     """

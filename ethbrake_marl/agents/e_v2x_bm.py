@@ -15,6 +15,7 @@ import numpy as np
 
 from ethbrake_marl.agents.pairwise import ConstantDeceleration, closed_form, pairwise
 from ethbrake_marl.agents.team import MODEL, NO_BODIES, STATE
+from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import StepSettings, failure, first_decision, step
@@ -31,13 +32,15 @@ LEAST_GAIN = 1e-3  # a gain in harm (m2/s2) too small to search for
 TIE_MARGIN = 1e-9  # harms (m2/s2) closer than this count as equal
 
 
-def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Floats = 8.0) -> ConstantDeceleration:
+def coupled(
+    alert: State, body: int, count: HarmCount = HONEST, horizon_s: float | Floats = 8.0
+) -> ConstantDeceleration:
     """Constant deceleration of vehicle ``body`` that does the least simulated harm, and this harm, in every world.
 
     All other vehicles hold their commands ``alert.wanted`` [n, N + 1] (m/s2). ``count``: harm to minimise
     (``episode.counts``). ``horizon_s``: time until which harm counts, one number or [n]. If the deceleration of the
     closed form does no harm, it is the result. Among decelerations of equal harm, the harm in a second count decides
-    (``counts.other_count``); then the middle one is the result. Harm has kinks and jumps as a function of the
+    (``HarmCount.tie_breaker``); then the middle one is the result. Harm has kinks and jumps as a function of the
     deceleration, so a deceleration between two samples of the search may do less harm.
     """
     until_s = np.full(alert.n, horizon_s, np.float64)
@@ -54,7 +57,7 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
     return ConstantDeceleration(best, harm[0])
 
 
-def harms(alert: State, body: int, decelerations: Floats, count: str, until_s: Floats) -> Floats:
+def harms(alert: State, body: int, decelerations: Floats, count: HarmCount, until_s: Floats) -> Floats:
     """Harm if vehicle ``body`` holds each of C decelerations, [2, n, C] m2/s2.
 
     Row 0 is the harm in ``count``, row 1 the harm in the count that breaks ties. ``decelerations`` [n, C] (m/s2) may
@@ -63,7 +66,7 @@ def harms(alert: State, body: int, decelerations: Floats, count: str, until_s: F
     return hold(alert, alert.wanted, [body], -decelerations[:, :, np.newaxis], until_s, count)
 
 
-def search_deceleration(alert: State, body: int, count: str, until_s: Floats) -> Floats:
+def search_deceleration(alert: State, body: int, count: HarmCount, until_s: Floats) -> Floats:
     """Best constant deceleration of vehicle ``body`` (m/s2), with its harm as in ``harms`` (m2/s2), [n, 3].
 
     The search divides the range of decelerations into ``FIRST_PARTS`` equal cells, and then, again and again, every
@@ -156,16 +159,16 @@ class EV2XBM:
     Args:
         settings: settings of the episodes (``Game.settings``).
         agents: vehicle (1: Vehicle 1) -> role, for vehicles driven by agents whose commands are not known at the alert.
-        count: harm to minimise: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        harm_count: count of harm to minimise (``episode.counts``).
 
     """
 
     name, knows = "e_v2x_bm", MODEL
 
     def __init__(
-        self, settings: StepSettings, agents: Mapping[int, str] = MappingProxyType({}), count: str = "first"
+        self, settings: StepSettings, agents: Mapping[int, str] = MappingProxyType({}), harm_count: AnyCount = HONEST
     ) -> None:
-        self.settings, self.agents, self.count = settings, dict(agents), count
+        self.settings, self.agents, self.count = settings, dict(agents), HarmCount.of(harm_count)
 
     def begin(self, alert: State, body: int) -> BaselineMemory:
         """Command for the whole episode, and its predicted harm.
@@ -192,7 +195,7 @@ class EV2XBM:
 class EV2XBMPairwise:
     """Brakes with the deceleration of ``pairwise``, the paper's closed form."""
 
-    name, knows = "e_v2x_bm:pairwise", STATE
+    name, knows, count = "e_v2x_bm:pairwise", STATE, FIRST_IMPACTS
 
     def begin(self, alert: State, body: int) -> BaselineMemory:
         """Command and predicted harm. Raises ``InvalidInput`` where the closed form does not hold (``pairwise``)."""

@@ -61,7 +61,7 @@ def evaluate_command(
     `ethbrake agent list` shows all agents; the name ladder is short for those that need no training, from bad to good.
     A name can be followed by a shield, +episode or +step; for instance full_brake+step or policy@PATH+step, where PATH
     is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
-    total harm instead of first-impact harm; with --set rules=honest, total harm and a price for pushes, for driving and
+    total harm instead of first-impact harm; with, total harm and a price for pushes, for driving and
     for motion at the horizon. --set measures=pushed_mps,pushed_m adds measures to the
     results. --scenario benchmark evaluates the tasks of the benchmark, and the name of a task only this task; there,
     agents minimise the honest cost.

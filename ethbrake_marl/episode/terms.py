@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import COUNTED_ROWS, pair_amounts
+from ethbrake_marl.episode.counts import COUNTED_ROWS, HarmCount, pair_amounts
 from ethbrake_marl.episode.functions import call_function, check_finite_values, description_of
 from ethbrake_marl.episode.hold import descend
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
@@ -174,7 +174,7 @@ def potential(settings: StepSettings, state: State) -> Floats:
     line = state.line.copy()
     line[:, COUNTED_ROWS] = 0.0
     state = state._replace(line=line)
-    _, least = descend(state, learners, shares, rounds, state.clock[:, END], settings.weights)
+    _, least = descend(state, learners, shares, rounds, state.clock[:, END], settings.count)
     least[state.ended] = 0.0
     return -least
 
@@ -196,19 +196,16 @@ class Shaping(NamedTuple):
         return value, new
 
 
-def growth(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
+def growth(objectives: Sequence[Objective], count: HarmCount, before: State, step: Step, after: State) -> Floats:
     """Term harm, [n, N]: minus the increase of the amount that each vehicle's objective minimises.
 
-    ``objectives`` has one per vehicle; ``count`` is the name of the count of harm (``episode.counts``).
+    ``objectives`` has one per vehicle.
     """
     return -amounts(objectives, before, after, count)
 
 
-def component(name: str, count: str) -> TermFunction:
-    """Function that computes the component ``harm_K``, ``pair_J_K`` or ``obstacle`` of a vector reward, [n].
-
-    ``count`` is the name of the count of harm.
-    """
+def component(name: str, count: HarmCount) -> TermFunction:
+    """Function that computes the component ``harm_K``, ``pair_J_K`` or ``obstacle`` of a vector reward, [n]."""
     if name == "obstacle":
         return partial(_of_pair, 0, count)
     last_vehicle = int(name.rpartition("_")[2])
@@ -217,15 +214,15 @@ def component(name: str, count: str) -> TermFunction:
     return partial(_of_pair, last_vehicle - 1, count)  # columns of pairs begin with the obstacle and Vehicle 1
 
 
-def _borne(vehicle: int, count: str, before: State, step: Step, after: State) -> Floats:
+def _borne(vehicle: int, count: HarmCount, before: State, step: Step, after: State) -> Floats:
     return 0.0 - Harm.of(_increase(count, before, after), after.car).borne[:, vehicle]
 
 
-def _of_pair(pair: int, count: str, before: State, step: Step, after: State) -> Floats:
+def _of_pair(pair: int, count: HarmCount, before: State, step: Step, after: State) -> Floats:
     return 0.0 - _increase(count, before, after)[0, :, pair]
 
 
-def _increase(count: str, before: State, after: State) -> Floats:
+def _increase(count: HarmCount, before: State, after: State) -> Floats:
     return pair_amounts(after.line, count) - pair_amounts(before.line, count)
 
 

@@ -87,7 +87,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str] | None = None,
-        reward: Any = "harm",
+        reward: Any = "honest",
         observation: Any = None,
         agents: str = "all",
         max_cycles: int | None = None,

@@ -38,7 +38,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.team import MODEL, Agent, propose
-from ethbrake_marl.episode.counts import check_count
+from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import follow_plans
 from ethbrake_marl.episode.script_calls import begin_script
@@ -88,7 +88,7 @@ class StepShield:
     Args:
         drivers: vehicle (1: Vehicle 1) -> agent. They propose where the caller does not, and the shield plans with
             them; None: no agents.
-        harm_count: harm to bound: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        harm_count: count of harm to bound (``episode.counts``).
         allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
         cap: ``baseline``: no vehicle bears more harm than under the best constant actions at the alert; None: no caps.
 
@@ -100,16 +100,16 @@ class StepShield:
         self,
         drivers: Mapping[int, Agent] | None = None,
         *,
-        harm_count: str = "first",
+        harm_count: AnyCount = HONEST,
         allowance: float = 0.0,
         cap: str | None = None,
     ) -> None:
-        check_count("shield: harm_count", harm_count)
         if isinstance(allowance, bool) or not isinstance(allowance, int | float) or not 0.0 <= allowance < np.inf:
             raise InvalidInput(f"shield: allowance = {allowance!r}: must be a finite number, at least 0 m2/s2")
         if cap not in (None, "baseline"):
             raise InvalidInput(f"shield: cap = {cap!r}: must be 'baseline' or None")
-        self.drivers, self.count, self.allowance, self.cap = checked_drivers(drivers), harm_count, float(allowance), cap
+        self.drivers, self.count = checked_drivers(drivers), HarmCount.of(harm_count, "shield: harm_count")
+        self.allowance, self.cap = float(allowance), cap
         self.rests: list[Fallback] = [(CONSTANT, constant)]
         if drivers:
             self.rests.append((POLICY_ROLLOUT, agents_drive))

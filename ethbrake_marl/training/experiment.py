@@ -148,7 +148,7 @@ def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: 
 
 
 def compared_teams(
-    trained: TrainResult, scenario: Scenario, harm_count: str, baselines: Sequence[str]
+    trained: TrainResult, scenario: Scenario, count: HarmCount, baselines: Sequence[str]
 ) -> Mapping[str, Team]:
     """Teams to compare: the baselines, then the trained policies without and with a shield.
 
@@ -162,7 +162,7 @@ def compared_teams(
         agents[TEAM] = specs
         agents |= {without(vehicle): {**specs, vehicle: FULL_BRAKE.name} for vehicle in specs}
         agents[SHIELDED] = f"{trained.agent}+step"
-    return teams_of(agents, scenario, harm_count=harm_count)
+    return teams_of(agents, scenario, harm_count=count)
 
 
 def without(vehicle: str) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.agents.team import ESTIMATED, Agent
+from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import hold_commands
@@ -48,7 +49,7 @@ class EstimatedShield(StepShield):
     knows = ESTIMATED
 
     def __init__(
-        self, drivers: Mapping[int, Agent] | None = None, *, scenario: Scenario, harm_count: str = "first"
+        self, drivers: Mapping[int, Agent] | None = None, *, scenario: Scenario, harm_count: AnyCount = HONEST
     ) -> None:
         super().__init__(drivers, harm_count=harm_count)
         self.line = line_of_learner(scenario)
@@ -112,7 +113,7 @@ class EstimatedEpisodeShield(EpisodeShield):
         drivers: Mapping[int, Agent] | None,
         *,
         scenario: Scenario,
-        harm_count: str = "first",
+        harm_count: AnyCount = HONEST,
         bound: str = "coupled",
     ) -> None:
         super().__init__(drivers, harm_count=harm_count, bound=bound)
@@ -133,13 +134,14 @@ class EstimatedEV2XBM:
     """E-V2X-BM, the best constant deceleration, computed in the line that the vehicle estimates (median line).
 
     It chooses a new deceleration when received values differ from the median line. ``is_pairwise``: use the paper's
-    closed form instead of a simulation of the line. ``count``: the harm that is minimised.
+    closed form of first-impact harm instead of a simulation of the line. ``harm_count``: harm that is minimised.
     """
 
     knows = ESTIMATED
 
-    def __init__(self, scenario: Scenario, is_pairwise: bool = False, count: str = "first") -> None:
-        self.scenario, self.is_pairwise, self.count = scenario, is_pairwise, count
+    def __init__(self, scenario: Scenario, is_pairwise: bool = False, harm_count: AnyCount = HONEST) -> None:
+        self.scenario, self.is_pairwise = scenario, is_pairwise
+        self.count = FIRST_IMPACTS if is_pairwise else HarmCount.of(harm_count)
         self.name = f"e_v2x_bm{':pairwise' if is_pairwise else ''}:estimated"
         self.lines: dict[int, MedianLine] = {}  # of each body
 

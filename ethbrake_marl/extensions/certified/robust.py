@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.team import MODEL, Agent
+from ethbrake_marl.episode.counts import HONEST, AnyCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import END, State, map_arrays, take
@@ -55,7 +56,7 @@ class RobustShield(StepShield):
         drivers: Mapping[int, Agent] | None = None,
         *,
         uncertainty: str | None = None,
-        harm_count: str = "first",
+        harm_count: AnyCount = HONEST,
         allowance: float = 0.0,
     ) -> None:
         super().__init__(drivers, harm_count=harm_count, allowance=allowance)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.agent_names import make_teams, open_game
 from ethbrake_marl.agents.team import Team
-from ethbrake_marl.episode.counts import COUNTS, check_count
+from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount, all_counts
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -34,7 +34,7 @@ MOST_CHOICES = 1_000  # choices of weights in a grid
 SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides between equal choices
 FIRST_SHARE = 0.6  # of the budget; the second round starts from the best results of all choices of weights
 
-BorneHarm = Mapping[str, Floats]  # count of harm -> harm that each vehicle bears
+BorneHarm = Mapping[str, Floats]  # name of a count of harm -> harm that each vehicle bears
 OnSearch = Callable[[int, int], None]  # called with the number of finished searches and of all
 
 
@@ -42,7 +42,7 @@ class Front(NamedTuple):
     """The harm of each vehicle in n worlds, under the best commands for each of W choices of weights."""
 
     weights: Floats  # [W, N] weights of the vehicles' harm
-    harm_count: str  # count that is weighted (``episode.counts``)
+    count: HarmCount  # which is weighted
     borne: BorneHarm  # [W, n, N] m2/s2 by count
     agents: Mapping[str, BorneHarm]  # agent -> harm of each vehicle if it drives, [W, n, N] m2/s2 by count
 
@@ -50,7 +50,7 @@ class Front(NamedTuple):
     def amounts(self) -> Floats:
         """Weighted harm of each world under the best commands for each choice of weights, [W, n] m2/s2."""
         return np.stack(
-            [weighted_harm(harm, row) for harm, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
+            [weighted_harm(harm, row) for harm, row in zip(self.borne[self.count.name], self.weights, strict=True)]
         )
 
 
@@ -120,7 +120,7 @@ def search_front(
     worlds: State,
     weights: Sequence[Sequence[float]] | Floats,
     *,
-    count: str = "honest",
+    harm_count: AnyCount = HONEST,
     budget: int = FRONT_BUDGET,
     threads: int = 1,
     agents: Sequence[str] = (),
@@ -145,7 +145,7 @@ def search_front(
         scenario: its learners are controlled.
         worlds: n worlds at the alert.
         weights: weights of the vehicles' harm, [W, N].
-        count: count of harm that is weighted: ``first``, ``total`` or ``honest``.
+        harm_count: count of harm that is weighted (``episode.counts``).
         budget: number of profiles (commands over time) that are tried for each world and choice of weights.
         threads: number of threads.
         agents: names of agents to compare. Each drives all learners, with each choice of weights as the scenario's
@@ -158,7 +158,7 @@ def search_front(
     ``harm_weight``.
 
     """
-    check_count("count", count)
+    count = HarmCount.of(harm_count)
     weights = weight_table(weights.tolist() if isinstance(weights, np.ndarray) else weights)
     if weights.shape[1] != scenario.vehicles:
         raise InvalidInput(
@@ -191,7 +191,7 @@ def search_front(
 
 
 def _join_chunks(parts: Sequence[BorneHarm]) -> BorneHarm:
-    return {count: np.concatenate([part[count] for part in parts], axis=1) for count in COUNTS}
+    return {count: np.concatenate([part[count] for part in parts], axis=1) for count in parts[0]}
 
 
 class Drivers(NamedTuple):
@@ -202,7 +202,7 @@ class Drivers(NamedTuple):
     alone: Mapping[int, Drivers]  # body -> the same for each of several learners, while the others brake fully
 
     @staticmethod
-    def of(scenario: Scenario, weights: Floats, names: Sequence[str], count: str) -> Drivers:
+    def of(scenario: Scenario, weights: Floats, names: Sequence[str], count: HarmCount) -> Drivers:
         """The learners of ``scenario``, and for each choice of weights (row of ``weights`` [W, N]) the agents
         ``names``, made to minimise the weighted harm.
 
@@ -221,7 +221,7 @@ class Drivers(NamedTuple):
 
 
 def _search_chunk(
-    drivers: Drivers, worlds: State, weights: Floats, count: str, effort: Mapping[str, int], tell: Callable[[int], None]
+    drivers: Drivers, worlds: State, weights: Floats, count: HarmCount, effort: Mapping[str, int], tell: Callable[[int], None]
 ) -> tuple[ProfilePool, dict[str, BorneHarm]]:
     """Pool of the best profiles (commands over time) of all searches, and the harm of each vehicle if agents drive.
 
@@ -229,7 +229,7 @@ def _search_chunk(
     starts from the best profiles of all choices. ``effort``: budget and threads. ``tell`` is called with numbers of
     finished searches.
     """
-    pool = ProfilePool(problem_of(drivers.game, worlds, count=count), count)
+    pool = ProfilePool(problem_of(drivers.game, worlds, harm_count=count), count)
     driven, problem = _try_known_commands(pool, worlds, weights, drivers.preferring), pool.problem
     starts: list[list[Profiles]] = [[*starting_profiles(problem, worlds)] for _ in weights]
     for body, single in drivers.alone.items():
@@ -271,7 +271,7 @@ def _try_known_commands(
                 profiles = driven_profiles(problem, game, worlds._replace(car=car), team)
                 driven[name].append(pool.add(profiles))
     return {
-        name: {count: np.stack([borne[count] for borne in results]) for count in COUNTS}
+        name: {count: np.stack([borne[count] for borne in results]) for count in pool.borne}
         for name, results in driven.items()
     }
 
@@ -291,17 +291,18 @@ def observes_weights(team: Team) -> bool:
 class ProfilePool:
     """Profiles (commands over time) that have been tried in n worlds, with the harm of each vehicle."""
 
-    def __init__(self, problem: Problem, count: str) -> None:
+    def __init__(self, problem: Problem, count: HarmCount) -> None:
         self.problem, self.count = problem, count
         self.profiles: list[Profiles] = []
-        self.borne: dict[str, list[Floats]] = {harm_count: [] for harm_count in COUNTS}
+        self.counts = all_counts(count)
+        self.borne: dict[str, list[Floats]] = {each.name: [] for each in self.counts}
 
     def add(self, profiles: Profiles) -> BorneHarm:
         """Simulate profiles and store them; return the harm of each vehicle, count -> [n, N] m2/s2."""
         self.profiles.append(profiles)
         last = self.problem.follow(profiles)
-        for count, harms in self.borne.items():
-            harms.append(last.borne_harm(count))
+        for count in self.counts:
+            self.borne[count.name].append(last.borne_harm(count))
         return {count: harms[-1] for count, harms in self.borne.items()}
 
     def choice(self, weights: Floats) -> Ints:
@@ -309,7 +310,7 @@ class ProfilePool:
 
         Among equal profiles, it has the least total harm of all vehicles. ``weights`` [N].
         """
-        borne = np.stack(self.borne[self.count])
+        borne = np.stack(self.borne[self.count.name])
         amounts = weighted_harm(borne, weights)
         least = amounts.min(axis=0)
         return np.asarray(np.where(amounts == least, borne.sum(axis=2), np.inf).argmin(axis=0))
@@ -339,9 +340,9 @@ def least_largest(
     game, parts = open_game(scenario)[1], []
     for first in range(0, worlds.n, FRONT_CHUNK):
         some = worlds.take(slice(first, first + FRONT_CHUNK))
-        table = best_harm(game, some, counts=(front.harm_count,), budget=budget, threads=threads, objective="maximin")
-        last = problem_of(game, some).follow(table.profiles[front.harm_count])
-        parts.append({count: last.borne_harm(count)[np.newaxis] for count in COUNTS})
-    every = {count: np.concatenate([_join_chunks(parts)[count], front.borne[count]]) for count in COUNTS}
-    chosen = every[front.harm_count].max(axis=2).argmin(axis=0)
+        table = best_harm(game, some, harm_counts=(front.count,), budget=budget, threads=threads, objective="maximin")
+        last = problem_of(game, some).follow(table.profiles[front.count.name])
+        parts.append({count.name: last.borne_harm(count)[np.newaxis] for count in all_counts(front.count)})
+    every = {count: np.concatenate([_join_chunks(parts)[count], front.borne[count]]) for count in front.borne}
+    chosen = every[front.count.name].max(axis=2).argmin(axis=0)
     return {count: borne[chosen, np.arange(worlds.n)] for count, borne in every.items()}

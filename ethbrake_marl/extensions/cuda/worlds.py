@@ -61,7 +61,7 @@ class Worlds:
         *,
         seed: int = 0,
         learners: Any = None,
-        reward: Any = "harm",
+        reward: Any = "honest",
         observation: Any = None,
     ) -> None:
         """Draw the pool of worlds, copy it to the device, and begin all episodes.
@@ -247,7 +247,7 @@ def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[KernelSett
         float(settings.time_step_s),
         float(settings.harm),
         float(settings.terminal),
-        on(settings.weights),
+        on(settings.count.weights),
     )
     view_arrays = ViewArrays(on(plan.offsets), plan.role, plan.obstacle, on(plan.places), on(plan.scaling))
     size = bodies, len(settings.learners), plan.scaling.shape[1], len(plan.offsets)

@@ -37,13 +37,13 @@ def to_parquet(
     scenario: AnyScenario,
     episodes: int,
     seed: int = SEED,
-    reward: Any = "harm",
+    reward: Any = "honest",
     force: bool = False,
 ) -> None:
     """Let agents drive, and write a Parquet file with one row for each agent, world and decision.
 
     Every agent of ``agents`` controls all learners, in the worlds 0 to ``episodes`` - 1 of ``seed``. ``reward``: a name
-    such as ``harm``, or the weights of the reward's terms. docs/data.md describes the file.
+    such as ``honest``, or the weights of the reward's terms. docs/data.md describes the file.
 
     Raises ``InvalidInput`` for an invalid argument, ``AlreadyExists`` if the file exists and ``force`` is false, and
     ``MissingExtra`` if pyarrow is not installed.

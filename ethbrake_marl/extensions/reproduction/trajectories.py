@@ -33,9 +33,9 @@ Records = Mapping[tuple[str, int], EpisodeRecord]  # (PPO or SAC, number of the 
 def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Records:
     records = {}
     for number in PAPER_SCENARIOS:
-        scenario, game = open_game(reading.only("acts_s", "rear_s").scenario(f"paper-scenario-{number}"))
+        scenario, game = open_game(reading.only("acts_s", "rear_s").scenario(f"paper-scenario-{number}"), reward="harm")
         world = scenario.sample(1, SEED)
-        for name, team in teams_of(dict(policies), scenario).items():
+        for name, team in teams_of(dict(policies), scenario, harm_count="first").items():
             records[name, number] = record_episode(world, team, game)
     return records
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import COUNTS, HARM
+from ethbrake_marl.episode.counts import all_counts
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput

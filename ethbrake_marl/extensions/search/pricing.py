@@ -14,7 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, pair_amount, unshared_amount, weights_of
+from ethbrake_marl.episode.counts import (
+    HONEST,
+    AnyCount,
+    HarmCount,
+    all_counts,
+    amount_so_far,
+    pair_amount,
+    unshared_amount,
+)
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
 from ethbrake_marl.episode.state import END, ENDED, FIRST_DECISION, LAST, STEPS, State, check_exact
@@ -140,14 +148,14 @@ class Problem(NamedTuple):
     >>> from ethbrake_marl.extensions.search.pricing import problem_of
     >>> scenario, game = eb.open_game("paper-random")
     >>> problem = problem_of(game, scenario.sample(2, seed=7))
-    >>> problem.follow(problem.constant(problem.even_grid(3)[:, 1:2])).harm()
+    >>> problem.follow(problem.constant(problem.even_grid(3)[:, 1:2])).harm("first")
     array([80.51086128, 64.27142879])
     """
 
     bodies: Ints  # [B] vehicles that are controlled (1: Vehicle 1)
     state: State  # at the first decision; all other vehicles hold ``wanted``
     time_step_s: float
-    harm_count: str  # what is minimised (`episode.counts`)
+    count: HarmCount  # what is minimised
     aim: float  # WHOLE_LINE, WEIGHTED or LARGEST
     shares: Floats  # [n, 3, N + 1] weights of what a pair's front and rear vehicle share, and of the rear's own amount
     identity: UInt64s  # [n] hash of everything that decides the harm of a profile (``identities``)
@@ -170,8 +178,8 @@ class Problem(NamedTuple):
     def take(self, rows: Any) -> Problem:
         return self._replace(state=self.state.take(rows), shares=self.shares[rows], identity=self.identity[rows])
 
-    def with_count(self, count: str) -> Problem:
-        return self._replace(harm_count=count)
+    def with_count(self, count: HarmCount) -> Problem:
+        return self._replace(count=count)
 
     def even_grid(self, number: int) -> Floats:
         """Evenly spaced commands from full braking to full driving, [n, number, B] m/s2."""
@@ -213,19 +221,19 @@ class Problem(NamedTuple):
             raise PhysicsError({k: "its profile could not be simulated" for k in np.flatnonzero(failed).tolist()})
         return State(line, car, clock, know, wanted, memories)
 
-    def value(self, last: State, count: str | None = None) -> Floats:
+    def value(self, last: State, count: HarmCount | None = None) -> Floats:
         """What the search minimises, for episodes with the last states ``last``, [n] m2/s2.
 
         ``count``: count of harm; None: the problem's.
         """
-        value, weights = np.empty(self.n), weights_of(self.harm_count if count is None else count)
-        worths(last.line, self.shares, weights, self.aim, value)
+        value = np.empty(self.n)
+        worths(last.line, self.shares, (count or self.count).weights, self.aim, value)
         return value
 
     def values(self, profiles: Profiles) -> dict[str, Floats]:
-        """What the search minimises if the vehicles follow ``profiles``, in every count of harm: count -> [n] m2/s2."""
+        """What the search minimises if the vehicles follow ``profiles``, in every count of harm: its name -> [n] m2/s2."""
         last = self.follow(profiles)
-        return {count: self.value(last, count) for count in COUNTS}
+        return {count.name: self.value(last, count) for count in all_counts(self.count)}
 
     def with_weights(self, weights: Floats, *, largest: bool = False) -> Problem:
         """Problem that minimises the sum of the vehicles' harm times ``weights`` [n, N].
@@ -266,7 +274,7 @@ def problem_of(
     alert: State,
     bodies: Sequence[int] | None = None,
     *,
-    count: str = "first",
+    harm_count: AnyCount = HONEST,
     objective: Declared = "total",
     deciders: Sequence[int] | None = None,
 ) -> Problem:
@@ -274,7 +282,7 @@ def problem_of(
 
     Learners that are not among ``bodies`` brake fully; all other vehicles hold the commands of their roles.
 
-    ``bodies``: controlled vehicles (1: Vehicle 1); None: the learners. ``count``: what is minimised
+    ``bodies``: controlled vehicles (1: Vehicle 1); None: the learners. ``harm_count``: what is minimised
     (``episode.counts``). ``objective``: whose harm counts, as in a scenario's key ``objective``. ``deciders``:
     vehicles whose shortest latency is the time of the first decision; None: ``bodies``.
 
@@ -282,7 +290,7 @@ def problem_of(
     harm or ``maximin``, and a script that observes the state, whose commands are not known at the alert.
     """
     check_exact(alert, "a search for the best braking")
-    check_count("count", count)
+    count = HarmCount.of(harm_count)
     chosen = np.array(game.settings.learners if bodies is None else bodies, np.int64)
     if not len(chosen) or len(np.intersect1d(chosen, range(1, alert.vehicles + 1))) < len(chosen):
         raise InvalidInput(f"vehicles {chosen.tolist()}: must be one or more of 1 to {alert.vehicles}, each once")

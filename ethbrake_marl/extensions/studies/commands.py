@@ -58,13 +58,14 @@ def falsify_command(
         import numpy as np
 
         from ethbrake_marl.cli.settings import read_settings
+        from ethbrake_marl.episode.counts import HONEST
         from ethbrake_marl.evaluation.identity import about_scenario, versions
         from ethbrake_marl.extensions.studies.machine import this_machine
         from ethbrake_marl.extensions.studies.weakness import WeaknessMeasure, states_of
 
         out.check(output, ".csv", what="worlds")
         chosen = read_settings(settings, of_command=("harm_count",))
-        count = chosen.command.get("harm_count", "first")
+        count = chosen.command.get("harm_count", HONEST)
         weakness = WeaknessMeasure.of(measure, agent, against, chosen.change_scenario(scenario), count)
         worlds, measured, scores = weakness.falsify(
             budget, seed, most=keep, on_round=lambda world_count: out.progress(agent, world_count, budget)
@@ -81,7 +82,7 @@ def falsify_command(
             "agent": agent,
             "measure": measure,
             "against": against,
-            "harm_count": count,
+            "harm_count": weakness.count.name,
             "scenario": weakness.scenario.name,
             "settings": list(chosen.texts),
             **about_scenario(weakness.scenario, seed),

@@ -9,6 +9,7 @@ import numpy as np
 
 from ethbrake_marl.agent_names import open_game, teams_of
 from ethbrake_marl.agents.team import Team, play_to_end
+from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -40,10 +41,12 @@ class WeaknessMeasure(NamedTuple):
     scenario: Scenario
     game: Game
     teams: tuple[Team, ...]  # the agent, then the rival if there is one
-    harm_count: str  # name of the count of harm (``episode.counts``)
+    count: HarmCount
 
     @classmethod
-    def of(cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: str = "first") -> WeaknessMeasure:
+    def of(
+        cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: AnyCount = HONEST
+    ) -> WeaknessMeasure:
         """The weakness measure ``name``, applied to an agent.
 
         ``against``: the rival, for ``regret`` only; None: the best known commands. Agents are names or objects, as for
@@ -54,13 +57,14 @@ class WeaknessMeasure(NamedTuple):
             raise unknown_name("measure", name, WEAKNESS_MEASURES)
         if name != "regret" and against is not None:
             raise InvalidInput(f"--against {against}: only --measure regret compares two agents; leave --against out")
-        loaded, game = open_game(scenario)
+        count = HarmCount.of(harm_count)
+        loaded, game = open_game(scenario, reward={"harm_count": count})
         chosen = [agent] if name != "regret" else [agent, HINDSIGHT if against is None else against]
         specs = (choice if isinstance(choice, str) else {"agent": choice} for choice in chosen)
-        teams = [tuple(teams_of(spec, loaded, harm_count=harm_count).values()) for spec in specs]
+        teams = [tuple(teams_of(spec, loaded, harm_count=count).values()) for spec in specs]
         if any(len(group) != 1 for group in teams):
             raise InvalidInput(f"agent {agent!r}, --against {against!r}: a name means several agents; name one agent")
-        return cls(name, loaded, game, sum(teams, ()), harm_count)
+        return cls(name, loaded, game, sum(teams, ()), count)
 
     def __call__(self, worlds: State) -> WeaknessResult:
         """Value of the measure in every world.
@@ -68,11 +72,11 @@ class WeaknessMeasure(NamedTuple):
         Raises ``InvalidInput`` for ``bound`` if the agent has no shield that promises a bound.
         """
         last, *rival_states = (play_to_end(self.game, worlds, team) for team in self.teams)
-        harm = last.harm(self.harm_count)
+        harm = last.harm(self.count)
         if self.name == "harm":
             return WeaknessResult(harm, harm, None)
         shielded = getattr(last.memories.get("shield"), "first", None)  # price of the shield's plan at the alert
-        reference = rival_states[0].harm(self.harm_count) if rival_states else shielded
+        reference = rival_states[0].harm(self.count) if rival_states else shielded
         if reference is None:
             raise InvalidInput(
                 f"agent {self.teams[0].name!r} is not behind a shield that promises a bound at the alert; --measure"
