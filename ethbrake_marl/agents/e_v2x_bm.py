@@ -168,7 +168,7 @@ class EV2XBM:
     def __init__(
         self, settings: StepSettings, agents: Mapping[int, str] = MappingProxyType({}), harm_count: AnyCount = HONEST
     ) -> None:
-        self.settings, self.agents, self.count = settings, dict(agents), HarmCount.of(harm_count)
+        self.settings, self.agents, self.harm_count = settings, dict(agents), HarmCount.of(harm_count)
 
     def begin(self, alert: State, body: int) -> BaselineMemory:
         """Command for the whole episode, and its predicted harm.
@@ -184,9 +184,9 @@ class EV2XBM:
         wanted, learners = alert.wanted.copy(), self.settings.learners
         wanted[:, learners] = -alert.braking_capacity_mps2[:, learners - 1]
         alert = alert._replace(wanted=wanted)
-        command = -coupled(alert, body, self.count, self.settings.horizon_s).deceleration_mps2
+        command = -coupled(alert, body, self.harm_count, self.settings.horizon_s).deceleration_mps2
         wanted[:, body] = command
-        return BaselineMemory(command, last_if_held(alert, self.settings).harm(self.count))
+        return BaselineMemory(command, last_if_held(alert, self.settings).harm(self.harm_count))
 
     def act(self, state: State, memory: BaselineMemory, body: int) -> tuple[Floats, BaselineMemory]:
         return memory.command, memory
@@ -195,7 +195,7 @@ class EV2XBM:
 class EV2XBMPairwise:
     """Brakes with the deceleration of ``pairwise``, the paper's closed form."""
 
-    name, knows, count = "e_v2x_bm:pairwise", STATE, FIRST_IMPACTS
+    name, knows, harm_count = "e_v2x_bm:pairwise", STATE, FIRST_IMPACTS
 
     def begin(self, alert: State, body: int) -> BaselineMemory:
         """Command and predicted harm. Raises ``InvalidInput`` where the closed form does not hold (``pairwise``)."""

@@ -53,8 +53,8 @@ def experiment_command(
     and report.html. If the scenario is one of the three tests (paper-random, paper-random-brake-only,
     paper-random-obstacle), the policy is also evaluated on the other two, and the recipe quick trains on all three
     together (mixture-three-tests). For a team, the report also shows the harm that each vehicle bears, and what each
-    learner adds. All agents minimise the honest cost; with --set harm_count=first, first-impact harm, for which pushing is
-    free. Ctrl-C ends the training early and evaluates the policy trained so far; a second Ctrl-C stops at once.
+    learner adds. All agents minimise the honest cost; with --set harm_count=first, first-impact harm, for which pushing
+    is free. Ctrl-C ends the training early and evaluates the policy trained so far; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_TRAINING) as out:
         from ethbrake_marl.agent_names import require_learner

@@ -96,9 +96,7 @@ class HarmCount:
 
 FIRST_IMPACTS = HarmCount("first", np.eye(6)[OF_FIRST], "first_impact_harm", "first-impact harm")
 ALL_IMPACTS = HarmCount("total", np.eye(6)[OF_TOTAL], "total_harm", "total harm")
-HONEST = HarmCount(
-    "honest", np.array([0.0, 1.0, 1.0, 10.0, 10.0, 1.0]), "honest_cost", "honest cost", (EXACT_IMPACTS,)
-)
+HONEST = HarmCount("honest", np.array([0.0, 1.0, 1.0, 10.0, 10.0, 1.0]), "honest_cost", "honest cost", (EXACT_IMPACTS,))
 IMPACT_COUNTS = (FIRST_IMPACTS, ALL_IMPACTS)  # counts of harm alone, which tables always show
 BUILT_IN_COUNTS = (*IMPACT_COUNTS, HONEST)
 
@@ -106,9 +104,10 @@ BUILT_IN_COUNTS = (*IMPACT_COUNTS, HONEST)
 def register_count(
     name: str, weights: Sequence[float] | Floats, *, column: str, words: str, requires: Sequence[str] = ()
 ) -> None:
-    """Register a ``HarmCount`` for rewards, agents, shields, searches and tables. Entry points: ``ethbrake_marl.counts``.
+    """Register a ``HarmCount`` for rewards, agents, shields, searches and tables.
 
-    Raises ``AlreadyExists`` for a name in use, and the errors of ``HarmCount``, whose fields the arguments are.
+    Entry points: ``ethbrake_marl.counts``. Raises ``AlreadyExists`` for a name in use, and the errors of ``HarmCount``,
+    whose fields the arguments are.
     """
     count = HarmCount(name, np.array(weights), column, words, tuple(requires))
     if column in {other.column for other in COUNTS.loaded.values() if other.name != name}:

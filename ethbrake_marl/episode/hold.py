@@ -123,8 +123,8 @@ def hold(
 ) -> Floats:
     """Harm if ``bodies`` hold constant commands until ``until_s`` (one time or [n]), [2, n, C] m2/s2.
 
-    The first row is the harm in ``harm_count``, the second the harm in the count that breaks ties. ``trials`` [n, C, B] are
-    C sets of commands for the B bodies (m/s2); all other bodies hold ``wanted`` [n, N + 1] (m/s2).
+    The first row is the harm in ``harm_count``, the second the harm in the count that breaks ties. ``trials`` [n, C, B]
+    are C sets of commands for the B bodies (m/s2); all other bodies hold ``wanted`` [n, N + 1] (m/s2).
     """
     count, out = HarmCount.of(harm_count), np.empty((2, *trials.shape[:2]))
     inputs = kernel_inputs(state, wanted, bodies, trials, until_s)

@@ -9,7 +9,15 @@ from operator import not_
 from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, PlainSerializer, PlainValidator, ValidationError, WithJsonSchema, field_validator, model_validator
+from pydantic import (
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidationError,
+    WithJsonSchema,
+    field_validator,
+    model_validator,
+)
 
 from ethbrake_marl.episode.counts import ALL_IMPACTS, COUNTS, FIRST_IMPACTS, HONEST, HarmCount
 from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of, parse_objective
@@ -169,9 +177,7 @@ REWARDS = {
     "honest": RewardParams(),
     "harm": RewardParams(harm_count=FIRST_IMPACTS),
     "total-harm": RewardParams(harm_count=ALL_IMPACTS),
-    "paper-reward": RewardParams(
-        harm=0.0, harm_count=FIRST_IMPACTS, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0
-    ),
+    "paper-reward": RewardParams(harm=0.0, harm_count=FIRST_IMPACTS, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
 }
 Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
 

@@ -50,7 +50,7 @@ class StepSettings(NamedTuple):
     horizon_s: float
     harm: float = 1.0  # weight of the line's harm in the reward
     terminal: float = 0.0  # weight of an end without impact in the reward
-    count: HarmCount = HONEST  # of harm in the reward (``episode.counts``)
+    harm_count: HarmCount = HONEST  # of harm in the reward (``episode.counts``)
     most_steps: float = np.inf  # number of steps after which an episode is truncated, as at the horizon
     threads: int = 1  # that advance slices of many worlds at once (``episode.threads``)
 
@@ -126,7 +126,7 @@ def step(
         rows: tuple[int, int] = step_worlds(
             old_line, old_clock, old_wanted, not donate, first, end, line, car, clock, wanted, actions,
             scratch_for(wanted.shape[1]), out, reward, settings.learners, settings.time_step_s, settings.harm,
-            settings.terminal, settings.count.weights,
+            settings.terminal, settings.harm_count.weights,
         )  # fmt: skip
         return rows
 

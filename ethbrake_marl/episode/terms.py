@@ -174,7 +174,7 @@ def potential(settings: StepSettings, state: State) -> Floats:
     line = state.line.copy()
     line[:, COUNTED_ROWS] = 0.0
     state = state._replace(line=line)
-    _, least = descend(state, learners, shares, rounds, state.clock[:, END], settings.count)
+    _, least = descend(state, learners, shares, rounds, state.clock[:, END], settings.harm_count)
     least[state.ended] = 0.0
     return -least
 

@@ -77,9 +77,7 @@ def shield(
     return around(team)
 
 
-def guard_team(
-    team: Team, mode: str, scenario: Scenario | None, count: HarmCount, options: Mapping[str, Any]
-) -> Team:
+def guard_team(team: Team, mode: str, scenario: Scenario | None, count: HarmCount, options: Mapping[str, Any]) -> Team:
     settings = AgentSettings(f"{team.name}+{mode}", None, scenario, count, options)
     guarded_team = wrap_team(team, str(mode), settings)
     if guarded_team.shield is None:

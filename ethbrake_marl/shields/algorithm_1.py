@@ -62,7 +62,7 @@ class EpisodeShield:
         if bound not in ("coupled", "pairwise"):
             raise InvalidInput(f"shield: bound = {bound!r}: must be 'coupled' or 'pairwise'")
         self.drivers, self.coupled = checked_drivers(drivers), bound == "coupled"
-        self.count = count if self.coupled else FIRST_IMPACTS  # which the closed form predicts
+        self.harm_count = count if self.coupled else FIRST_IMPACTS  # which the closed form predicts
         if len(self.drivers) != 1:
             raise InvalidInput(
                 f"shield: mode 'episode' needs the policy of exactly one learner, not of {len(self.drivers)}; mode"
@@ -75,12 +75,14 @@ class EpisodeShield:
         ((body, agent),) = self.drivers.items()
         remembered = begin_script(game.agents({body: agent})[body], alert, body)
         worlds = alert._replace(wanted=state.wanted)
-        choice = coupled(worlds, body, self.count, state.clock[:, END]) if self.coupled else pairwise(worlds, body)
+        choice = coupled(worlds, body, self.harm_count, state.clock[:, END]) if self.coupled else pairwise(worlds, body)
         backup = actions_of(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
         held_back = constant_plans(game, backup)
         policy_state = state._replace(memories={**state.memories, body: remembered})
-        policy_harm = price(game, state, rollout(game, self.drivers, policy_state, held_back, self.count), self.count)
-        bound_harm = price(game, state, held_back, self.count) if self.coupled else choice.harm
+        policy_harm = price(
+            game, state, rollout(game, self.drivers, policy_state, held_back, self.harm_count), self.harm_count
+        )
+        bound_harm = price(game, state, held_back, self.harm_count) if self.coupled else choice.harm
         nothing = np.zeros((state.n, 1))
         return EpisodeShieldMemory(
             policy_harm <= bound_harm, policy_harm, bound_harm, backup, remembered, nothing, nothing,

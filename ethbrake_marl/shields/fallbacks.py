@@ -54,9 +54,7 @@ def constant_plans(game: Game, actions: Floats) -> Floats:
     return np.repeat(actions[:, np.newaxis], decisions, axis=1)
 
 
-def best_constant(
-    game: Game, states: State, plans: Floats, count: HarmCount, below: Floats
-) -> tuple[Floats, Floats]:
+def best_constant(game: Game, states: State, plans: Floats, count: HarmCount, below: Floats) -> tuple[Floats, Floats]:
     """Constant actions with the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
 
     A candidate is the next actions of ``plans`` [n, T, L] with one of ``CHANGES`` added to all of them. With several

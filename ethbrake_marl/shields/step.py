@@ -108,7 +108,7 @@ class StepShield:
             raise InvalidInput(f"shield: allowance = {allowance!r}: must be a finite number, at least 0 m2/s2")
         if cap not in (None, "baseline"):
             raise InvalidInput(f"shield: cap = {cap!r}: must be 'baseline' or None")
-        self.drivers, self.count = checked_drivers(drivers), HarmCount.of(harm_count, "shield: harm_count")
+        self.drivers, self.harm_count = checked_drivers(drivers), HarmCount.of(harm_count, "shield: harm_count")
         self.allowance, self.cap = float(allowance), cap
         self.rests: list[Fallback] = [(CONSTANT, constant)]
         if drivers:
@@ -127,14 +127,14 @@ class StepShield:
         (m2/s2); the result is then its harm so far. The harm is infinite if a vehicle would bear more than its cap
         (``caps`` [n, N] m2/s2).
         """
-        last, harm = follow_plans(game, states, plans, self.count, most)
+        last, harm = follow_plans(game, states, plans, self.harm_count, most)
         if caps is not None:
-            harm[(last.borne_harm(self.count) > caps).any(axis=1)] = np.inf
+            harm[(last.borne_harm(self.harm_count) > caps).any(axis=1)] = np.inf
         return harm
 
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
         """Copy of ``plans`` in which the shield's agents drive from ``state`` until the harm is above ``most`` [n]."""
-        return rollout(game, self.drivers, state, plans, self.count, most)
+        return rollout(game, self.drivers, state, plans, self.harm_count, most)
 
     def bound(self, memory: StepShieldMemory) -> Floats:
         return np.maximum(memory.price, memory.first + self.allowance) if self.allowance else memory.price
@@ -146,7 +146,7 @@ class StepShield:
         return {body: begin_script(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        return first_plans(game, alert, state, self.count)
+        return first_plans(game, alert, state, self.harm_count)
 
     def cheapest(self, game: Game, states: State, plans: list[Floats]) -> tuple[Floats, Floats]:
         """Plan with the smallest price in each world, [n, T, L], and this price, [n] m2/s2."""
@@ -162,14 +162,14 @@ class StepShield:
         (``possible_states``). ``agents``: vehicle -> memory at the alert.
         """
         plan, harm = self.cheapest(game, states, self.plans(game, alert, state, states))
-        caps = follow_plans(game, state, plan, self.count)[0].borne_harm(self.count) if self.cap else None
+        caps = follow_plans(game, state, plan, self.harm_count)[0].borne_harm(self.harm_count) if self.cap else None
         if agents:
             check_drivers(game, agents)
             agent_plan = self.rolled_out(game, state._replace(memories={**state.memories, **agents}), plan)
             value = self.price(game, states, agent_plan, caps=caps)
             better = value <= harm
             plan[better], harm[better] = agent_plan[better], value[better]
-        last, _ = follow_plans(game, state, plan, self.count)
+        last, _ = follow_plans(game, state, plan, self.harm_count)
         settles: Bools = (last.line[:, SPEED] == 0.0).all(axis=1) & (last.line[:, FORCE] <= 0.0).all(axis=1)
         nothing = np.zeros((state.n, len(game.settings.learners)))
         return StepShieldMemory(
@@ -296,8 +296,8 @@ class StepShield:
         memory: StepShieldMemory = state.memories["shield"]
         borne = {}
         if memory.caps is not None:
-            last, _ = follow_plans(game, state, memory.plan, self.count)
-            borne = {"own_harm": last.borne_harm(self.count), "baseline_own_harm": memory.caps}
+            last, _ = follow_plans(game, state, memory.plan, self.harm_count)
+            borne = {"own_harm": last.borne_harm(self.harm_count), "baseline_own_harm": memory.caps}
         return {
             **borne,
             "bound_harm": self.bound(memory),
@@ -331,8 +331,8 @@ def constant(
     The estimate is 0 (unknown) if scripts look at the state.
     """
     if not game.scripts:
-        return best_constant(game, after, plans, shield.count, below)
-    plans, _ = best_constant(game, after, plans, shield.count, np.full(len(plans), np.inf))
+        return best_constant(game, after, plans, shield.harm_count, below)
+    plans, _ = best_constant(game, after, plans, shield.harm_count, np.full(len(plans), np.inf))
     return plans, np.zeros(len(plans))
 
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import Team
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.evaluate import EPISODES, SEED, evaluate

@@ -141,7 +141,7 @@ class EstimatedEV2XBM:
 
     def __init__(self, scenario: Scenario, is_pairwise: bool = False, harm_count: AnyCount = HONEST) -> None:
         self.scenario, self.is_pairwise = scenario, is_pairwise
-        self.count = FIRST_IMPACTS if is_pairwise else HarmCount.of(harm_count)
+        self.harm_count = FIRST_IMPACTS if is_pairwise else HarmCount.of(harm_count)
         self.name = f"e_v2x_bm{':pairwise' if is_pairwise else ''}:estimated"
         self.lines: dict[int, MedianLine] = {}  # of each body
 
@@ -165,7 +165,7 @@ class EstimatedEV2XBM:
         if len(rows):
             here = median.take(rows)
             choice = pairwise(here, body) if self.is_pairwise else None
-            choice = choice or coupled(here, body, self.count, self.scenario.horizon_s)
+            choice = choice or coupled(here, body, self.harm_count, self.scenario.horizon_s)
             command[rows] = -choice.deceleration_mps2
         return command, ChoiceMemory(median, command)
 

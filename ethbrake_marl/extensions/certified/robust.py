@@ -106,7 +106,7 @@ class RobustShield(StepShield):
             return plans
         actions = np.repeat(CONSTANT_ACTIONS[:, np.newaxis], len(learners), axis=1)
         commands = actions * states.braking_capacity_mps2[:, np.newaxis, learners - 1]
-        harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], self.count)[0]
+        harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], self.harm_count)[0]
         best = harm.reshape(n, states.n // n, -1).max(axis=1).argmin(axis=1)
         return [*plans, constant_plans(game, actions[best])]
 

@@ -227,7 +227,12 @@ def with_optima(plan: Ablation, measured: Sequence[LevelResult], threads: int, t
                 say = partial(_tell_progress, tell, f"joint optimum of {name}")
                 folder = plan.folder / "optimum" / name
                 tables[identity] = search_list(
-                    game, worlds, chunks=folder, on_progress=say, harm_counts=BUILT_IN_COUNTS, budget=plan.budget,
+                    game,
+                    worlds,
+                    chunks=folder,
+                    on_progress=say,
+                    harm_counts=BUILT_IN_COUNTS,
+                    budget=plan.budget,
                     threads=threads,
                 )
             teams = [result.reached for result in measured if result.level.name == name]

@@ -159,9 +159,9 @@ def front_command(
     """Show how sparing one vehicle changes the harm of the others.
 
     For each choice of weights, a search looks in every world for the commands with the least weighted honest cost (with
-    --set harm_count=first: first-impact harm). Beside them stand full braking, maximin (the least that the largest cost of a
-    vehicle can be) and agents, each of which drives all learners. The default weights are a grid, equal weights, and,
-    for each vehicle, 1 with a tiny weight for all others. The command writes front.json and front.png.
+    --set harm_count=first: first-impact harm). Beside them stand full braking, maximin (the least that the largest cost
+    of a vehicle can be) and agents, each of which drives all learners. The default weights are a grid, equal weights,
+    and, for each vehicle, 1 with a tiny weight for all others. The command writes front.json and front.png.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np

@@ -42,7 +42,7 @@ class Front(NamedTuple):
     """The harm of each vehicle in n worlds, under the best commands for each of W choices of weights."""
 
     weights: Floats  # [W, N] weights of the vehicles' harm
-    count: HarmCount  # which is weighted
+    harm_count: HarmCount  # which is weighted
     borne: BorneHarm  # [W, n, N] m2/s2 by count
     agents: Mapping[str, BorneHarm]  # agent -> harm of each vehicle if it drives, [W, n, N] m2/s2 by count
 
@@ -50,7 +50,7 @@ class Front(NamedTuple):
     def amounts(self) -> Floats:
         """Weighted harm of each world under the best commands for each choice of weights, [W, n] m2/s2."""
         return np.stack(
-            [weighted_harm(harm, row) for harm, row in zip(self.borne[self.count.name], self.weights, strict=True)]
+            [weighted_harm(harm, row) for harm, row in zip(self.borne[self.harm_count.name], self.weights, strict=True)]
         )
 
 
@@ -221,7 +221,12 @@ class Drivers(NamedTuple):
 
 
 def _search_chunk(
-    drivers: Drivers, worlds: State, weights: Floats, count: HarmCount, effort: Mapping[str, int], tell: Callable[[int], None]
+    drivers: Drivers,
+    worlds: State,
+    weights: Floats,
+    count: HarmCount,
+    effort: Mapping[str, int],
+    tell: Callable[[int], None],
 ) -> tuple[ProfilePool, dict[str, BorneHarm]]:
     """Pool of the best profiles (commands over time) of all searches, and the harm of each vehicle if agents drive.
 
@@ -259,7 +264,7 @@ def _try_known_commands(
     constants = problem.constant(problem.even_grid(FRONT_CONSTANTS))
     for q in range(FRONT_CONSTANTS):
         pool.add(constants.take(slice(q, None, FRONT_CONSTANTS)))
-    pool.add(best_stored(problem, pool.count)[1])
+    pool.add(best_stored(problem, pool.harm_count)[1])
     driven: dict[str, list[BorneHarm]] = {name: [] for name in preferring[0][1]}
     for row, (game, teams) in zip(weights, preferring, strict=True):
         car = worlds.car.copy()
@@ -292,7 +297,7 @@ class ProfilePool:
     """Profiles (commands over time) that have been tried in n worlds, with the harm of each vehicle."""
 
     def __init__(self, problem: Problem, count: HarmCount) -> None:
-        self.problem, self.count = problem, count
+        self.problem, self.harm_count = problem, count
         self.profiles: list[Profiles] = []
         self.counts = all_counts(count)
         self.borne: dict[str, list[Floats]] = {each.name: [] for each in self.counts}
@@ -310,7 +315,7 @@ class ProfilePool:
 
         Among equal profiles, it has the least total harm of all vehicles. ``weights`` [N].
         """
-        borne = np.stack(self.borne[self.count.name])
+        borne = np.stack(self.borne[self.harm_count.name])
         amounts = weighted_harm(borne, weights)
         least = amounts.min(axis=0)
         return np.asarray(np.where(amounts == least, borne.sum(axis=2), np.inf).argmin(axis=0))
@@ -340,9 +345,11 @@ def least_largest(
     game, parts = open_game(scenario)[1], []
     for first in range(0, worlds.n, FRONT_CHUNK):
         some = worlds.take(slice(first, first + FRONT_CHUNK))
-        table = best_harm(game, some, harm_counts=(front.count,), budget=budget, threads=threads, objective="maximin")
-        last = problem_of(game, some).follow(table.profiles[front.count.name])
-        parts.append({count.name: last.borne_harm(count)[np.newaxis] for count in all_counts(front.count)})
+        table = best_harm(
+            game, some, harm_counts=(front.harm_count,), budget=budget, threads=threads, objective="maximin"
+        )
+        last = problem_of(game, some).follow(table.profiles[front.harm_count.name])
+        parts.append({count.name: last.borne_harm(count)[np.newaxis] for count in all_counts(front.harm_count)})
     every = {count: np.concatenate([_join_chunks(parts)[count], front.borne[count]]) for count in front.borne}
-    chosen = every[front.count.name].max(axis=2).argmin(axis=0)
+    chosen = every[front.harm_count.name].max(axis=2).argmin(axis=0)
     return {count: borne[chosen, np.arange(worlds.n)] for count, borne in every.items()}

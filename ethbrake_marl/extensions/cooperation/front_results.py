@@ -20,13 +20,13 @@ from ethbrake_marl.evaluation.summary import by_recording
 from ethbrake_marl.extensions.cooperation.front import BorneHarm, Front, weighted_harm
 from ethbrake_marl.extensions.cooperation.results import Json
 from ethbrake_marl.extensions.report.style import (
+    axis_title,
     finish,
     in_our_style,
     label_text,
     new_panels,
     plain_number,
     series_style,
-    title_of,
 )
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
@@ -58,12 +58,12 @@ def front_results(
         "seed": seed,
         "episodes": drawn_worlds.worlds.n,
         **({} if by is None else {"recordings": len(np.unique(by))}),
-        "harm_count": front.count.name,
+        "harm_count": front.harm_count.name,
         "vehicles": list(scenario.vehicle_names),
         "beside": {name: _vehicles(borne, by) for name, borne in beside.items()},
         "points": _points(front, front.borne, by),
         "agents": {name: _points(front, borne, by) for name, borne in front.agents.items()},
-        "hypervolume": hypervolumes(front, beside["full_brake"][front.count.name]),
+        "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count.name]),
         "scenario_sha256": about_scenario(scenario)["scenario_sha256"],
         "worlds_sha256": worlds_sha256(drawn_worlds.worlds),
         "versions": versions(),
@@ -73,7 +73,7 @@ def front_results(
 def _points(front: Front, borne: BorneHarm, by: Clusters) -> list[Json]:
     points = []
     for k, (weights, least) in enumerate(zip(front.weights, front.amounts, strict=True)):
-        harm = borne[front.count.name][k]
+        harm = borne[front.harm_count.name][k]
         amounts = weighted_harm(harm, weights)
         points.append({
             "weights": weights.tolist(),
@@ -102,7 +102,8 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
     if len(full_brake.T) > MOST_DIMENSIONS:
         return []
     points = {
-        name: borne[front.count.name].mean(axis=1) for name, borne in {FRONT_NAME: front.borne, **front.agents}.items()
+        name: borne[front.harm_count.name].mean(axis=1)
+        for name, borne in {FRONT_NAME: front.borne, **front.agents}.items()
     }
     braking = full_brake.mean(axis=0)
     references = {
@@ -191,7 +192,9 @@ def hypervolume_sheet(results: Json) -> Sheet:
         for name, volume in entry["of"].items()
     ]
     columns: list[Column | str] = ["Reference", "Of", Column("Hypervolume"), share]
-    return Sheet(f"Hypervolume of the mean {HarmCount.of(results['harm_count']).words}, (m2/s2)^N", columns, rows, gap=2)
+    return Sheet(
+        f"Hypervolume of the mean {HarmCount.of(results['harm_count']).words}, (m2/s2)^N", columns, rows, gap=2
+    )
 
 
 @in_our_style
@@ -214,7 +217,9 @@ def front_figure(results: Json) -> Figure:
             axis.set_major_formatter(FuncFormatter(plain_number))
             axis.set_minor_formatter(FuncFormatter(plain_number))
     axes.tick_params(which="minor", labelsize=7)
-    axes.set(xlabel=f"Line: {title_of(count).lower()}", ylabel=f"Vehicle that bears most: {title_of(count).lower()}")
+    axes.set(
+        xlabel=f"Line: {axis_title(count).lower()}", ylabel=f"Vehicle that bears most: {axis_title(count).lower()}"
+    )
     worlds = count_of(results["episodes"], "world")
     caption = f"{results['scenario']}, {worlds}; one point for each of {len(results['points'])} choices of the weights."
     return finish(figure, caption, axes, columns=2, fontsize=8)

@@ -20,12 +20,12 @@ from ethbrake_marl.extensions.cooperation.ablation import CSV, FIGURE, FULL, JSO
 from ethbrake_marl.extensions.cooperation.seeds import mean_over_seeds, share_over_seeds
 from ethbrake_marl.extensions.report.style import (
     GREY,
+    axis_title,
     finish,
     in_our_style,
     new_panels,
     series_style,
     write_picture,
-    title_of,
 )
 from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
@@ -205,12 +205,12 @@ def levels_csv(measured: Sequence[LevelResult], searched: int) -> str:
             row: Json = {**level_key(result), "algorithm": result.algorithm, "seed": seed if result.algorithm else None}
             row |= {name: float(values[seed].mean()) for name, values in result.reached.items()}
             for count in BUILT_IN_COUNTS:
-                name = count.column
+                name, best = count.column, None if result.best is None else result.best[count.name]
                 row |= {
                     f"full_brake_{name}": float(result.braking[name].mean()),
                     f"searched_{name}": float(result.reached[name][seed, :searched].mean()),
                     f"searched_full_brake_{name}": float(result.braking[name][:, :searched].mean()),
-                    f"searched_best_known_{name}": None if result.best is None else float(result.best[count.name].mean()),
+                    f"searched_best_known_{name}": None if best is None else float(best.mean()),
                 }
             rows.append(row)
     return csv_text(rows)
@@ -304,7 +304,7 @@ def ablation_figure(results: Json, caption: str) -> Figure:
             axes.set_xticks([at[name] for name in names], words, fontsize=8)
         braking = [level[count.name]["searched"]["full_brake"]["value"] for level in levels]
         axes.set_ylim(0.0, min(1.1 * axes.get_ylim()[1], MOST_SHOWN * float(np.median(braking))))
-        axes.set(title=title_of(count), xlabel=results["settings"]["swept"] or "")
+        axes.set(title=axis_title(count), xlabel=results["settings"]["swept"] or "")
     return finish(figure, " ".join([*results["undertrained"], caption]), panels[0], columns=3, fontsize=8.5)
 
 

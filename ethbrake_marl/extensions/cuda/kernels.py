@@ -151,7 +151,7 @@ def play_world(t, memory, stored, pool, following, actions, results, settings, v
         refused, failed = step_worlds(
             memory.line, memory.clock, memory.wanted, False, 0, 1, memory.line, memory.car, memory.clock, memory.wanted,
             memory.actions, memory.scratch, memory.out, memory.reward, settings.learners,
-            settings.time_step_s, settings.harm, settings.terminal, settings.count.weights,
+            settings.time_step_s, settings.harm, settings.terminal, settings.harm_count.weights,
         )  # fmt: skip
         for row in range(memory.out.shape[0]):
             results.out[row, t] = memory.out[row, 0] if refused < 0 else 0.0

@@ -247,7 +247,7 @@ def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[KernelSett
         float(settings.time_step_s),
         float(settings.harm),
         float(settings.terminal),
-        on(settings.count.weights),
+        on(settings.harm_count.weights),
     )
     view_arrays = ViewArrays(on(plan.offsets), plan.role, plan.obstacle, on(plan.places), on(plan.scaling))
     size = bodies, len(settings.learners), plan.scaling.shape[1], len(plan.offsets)

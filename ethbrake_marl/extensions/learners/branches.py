@@ -56,7 +56,7 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
         gained[rows] += discount * step.reward[:, learners - 1]
         over = after.ended
         if only_harm and number >= at_least:
-            over |= stands_for_good(now, after, game.settings.count.weights)
+            over |= stands_for_good(now, after, game.settings.harm_count.weights)
         if over.any():
             ended.append(rows[over])
             last.append(after.take(over))

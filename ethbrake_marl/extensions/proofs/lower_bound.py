@@ -252,8 +252,8 @@ def lower_bound(
     Args:
         state: the n episodes now.
         body: the controlled vehicle (1: Vehicle 1); all others brake fully.
-        harm_count: ``first`` (of each pair only the first impact), ``total``, or ``honest``. The honest cost is never below
-            total harm; with a time step, ``combined`` also counts the prices of pushing and driving and further
+        harm_count: ``first`` (of each pair only the first impact), ``total``, or ``honest``. The honest cost is never
+            below total harm; with a time step, ``combined`` also counts the prices of pushing and driving and further
             impacts (``chain_search``), which takes 0.02 s a world.
         horizon_s: time until which harm counts, s after the alert.
         time_step_s: time between two decisions (s); the first decision is when the vehicle may act. None: commands

@@ -60,9 +60,9 @@ STYLE: dict[str, Any] = {
 in_our_style = matplotlib.style.context(["default", STYLE])
 
 
-
-def title_of(count: HarmCount) -> str:
+def axis_title(count: HarmCount) -> str:
     return f"{count.words.capitalize()} (m²/s²)"
+
 
 _CHARACTERS_PER_INCH = 17.0  # of a caption
 

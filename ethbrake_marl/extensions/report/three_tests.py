@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ethbrake_marl.episode.counts import COLUMN
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.summary import caption
@@ -23,7 +23,7 @@ TESTS = {
     "paper-random-obstacle": "Obstacle test: the same worlds with an obstacle 1.7 m beyond the place where Vehicle 1"
     " stops by itself. An impact of Vehicle 1 with the obstacle is harm.",
 }
-SHORT_TABLE = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the short table, if they are shown
+SHORT_TABLE = ("collision_rate", *(count.column for count in BUILT_IN_COUNTS), "pushed_mps")  # if they are shown
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
@@ -43,9 +43,9 @@ def title_of(name: str) -> str:
 
 
 def short_sheet(compared: Comparison, test_results: Mapping[str, Comparison]) -> Sheet:
-    """Short table of agents: collision rate, first-impact and total harm.
+    """Short table of agents: collision rate, first-impact harm, total harm, honest cost and, if measured, the push.
 
-    If agents minimise the honest cost, also this cost and the push. ``test_results``: name of another test -> its
+    ``test_results``: name of another test -> its
     results, whose means follow as further rows.
     """
     table = compared.table

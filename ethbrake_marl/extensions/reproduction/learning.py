@@ -19,7 +19,7 @@ from ethbrake_marl.episode.counts import FIRST_IMPACTS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import curve_over_seeds, curves_figure
-from ethbrake_marl.extensions.report.style import title_of
+from ethbrake_marl.extensions.report.style import axis_title
 from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.verdicts import VERDICT_TOLERANCE, Claim, Less, judge
 from ethbrake_marl.files.plain import read_object
@@ -315,7 +315,7 @@ def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
         "Mean return of training episodes": {
             name: curve_over_seeds(course.returns) for name, course in delay_courses.items()
         },
-        f"{title_of(FIRST_IMPACTS)}, fixed list": {
+        f"{axis_title(FIRST_IMPACTS)}, fixed list": {
             name: curve_over_seeds(course.harm) for name, course in delay_courses.items()
         },
     }

@@ -139,7 +139,7 @@ class PaperMap:
         Raises ``InvalidInput`` for the honest cost, push, driving and motion at the horizon, which need exact impacts.
         """
         counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
-        count = game.settings.count
+        count = game.settings.harm_count
         if count.requires or counted:
             what = f"the term {counted[0]}" if counted else f"harm_count {count.name}"
             right = "leave it out" if counted else "write harm_count first or total"
@@ -188,7 +188,7 @@ class PaperMap:
         ends = after.ended & ~over
         out[TERMINATED], out[TRUNCATED] = ends & after.at_rest, ends & ~after.at_rest
         out[SAFE_END] = ends & ~after.collided
-        weights = settings.count.weights
+        weights = settings.harm_count.weights
         out[COST] = weights[OF_FIRST] * out[FIRST_HARM] + weights[OF_TOTAL] * out[TOTAL_HARM]
         shared = settings.terminal * out[SAFE_END] - settings.harm * out[COST]
         reward = np.repeat(shared[:, np.newaxis], state.vehicles, axis=1)

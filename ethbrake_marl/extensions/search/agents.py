@@ -46,12 +46,12 @@ class Planner:
     knows = MODEL
 
     def __init__(self, name: str, scenario: Scenario, harm_count: AnyCount) -> None:
-        self.name, self.scenario, self.count = name, scenario, HarmCount.of(harm_count)
+        self.name, self.scenario, self.harm_count = name, scenario, HarmCount.of(harm_count)
 
     def begin(self, alert: State, body: int) -> SearchMemory:
         """Choose all commands. Raises ``InvalidInput`` if another vehicle's commands are not known at the alert."""
         game, alert = single_learner_game(self.scenario, alert, body)
-        problem = problem_of(game, alert, harm_count=self.count, objective=self.scenario.objective)
+        problem = problem_of(game, alert, harm_count=self.harm_count, objective=self.scenario.objective)
         commands, harm = self.choose(game, alert, problem, body)
         return SearchMemory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
 
@@ -90,7 +90,7 @@ class BestHarm(Planner):
             warnings.warn(f"{self.name}: searches every world: {outdated[game.name]}", Unfamiliar, stacklevel=2)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        known_harm, profiles = best_stored(problem, self.count)
+        known_harm, profiles = best_stored(problem, self.harm_count)
         commands = profiles.stepwise(int(problem.last_step.max()))[:, :, 0]
         harm = problem.value(problem.follow(profiles))
         some = (np.isinf(known_harm) | (self.scenario.objective != "total")).nonzero()[0]
@@ -105,12 +105,12 @@ class BestHarm(Planner):
         profiles, values = search_profiles(problem, [e_v2x_bm_profiles(problem, alert)], budget=self.budget)
         best = profiles.stepwise(steps)[:, :, 0]
         if self.scenario.learners != (body,):
-            return best, values[self.count.name]
-        start = START.get(self.count.name, OTHER_START)
+            return best, values[self.harm_count.name]
+        start = START.get(self.harm_count.name, OTHER_START)
         policy = make_agent(start, scenario=self.scenario)
         assert not isinstance(policy, Team)
         policy_commands = agent_commands(problem, game, alert, Team(start, {body: policy}))[:, :, 0]
-        better = refine(problem, policy_commands, budget=1)[1] < values[self.count.name]
+        better = refine(problem, policy_commands, budget=1)[1] < values[self.harm_count.name]
         first = np.where(better[:, np.newaxis], policy_commands, best[:, : policy_commands.shape[1]])
         best[:, : policy_commands.shape[1]], harm = refine(problem, first, budget=self.budget)
         return best, harm

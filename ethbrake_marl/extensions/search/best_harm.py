@@ -50,8 +50,8 @@ def best_harm(
     Args:
         game: game of the worlds' scenario.
         alert: worlds at the alert.
-        harm_counts: counts of harm to search, one after the other (``episode.counts``). A profile found for one count is
-            also tried for the others.
+        harm_counts: counts of harm to search, one after the other (``episode.counts``). A profile found for one count
+            is also tried for the others.
         bodies: vehicles that are controlled (1: Vehicle 1); None: the learners.
         budget: number of profiles that are simulated in each world, for each count.
         seed: seed of the random search.
@@ -98,7 +98,9 @@ def _search(
 ) -> tuple[Profiles, dict[str, Floats]]:
     starts, bodies = starting_profiles(problem, alert, first_profiles), problem.bodies.tolist()
     for body in bodies if len(bodies) > 1 else ():
-        single_problem = problem_of(game, alert, [body], harm_count=problem.count, objective=objective, deciders=bodies)
+        single_problem = problem_of(
+            game, alert, [body], harm_count=problem.harm_count, objective=objective, deciders=bodies
+        )
         starts.append(
             beside_braking(problem, single_problem, _search(game, alert, single_problem, (), objective, effort)[0])
         )
@@ -118,7 +120,7 @@ def starting_profiles(problem: Problem, alert: State, first_profiles: Sequence[P
 
 def e_v2x_bm_profiles(problem: Problem, alert: State) -> Profiles:
     alert, end_s = alert._replace(wanted=problem.state.wanted), problem.state.clock[:, END]
-    choice = coupled(alert, int(problem.bodies[0]), problem.count, end_s)
+    choice = coupled(alert, int(problem.bodies[0]), problem.harm_count, end_s)
     return problem.constant(-choice.deceleration_mps2[:, np.newaxis, np.newaxis])
 
 
@@ -157,7 +159,9 @@ def search_list(
         some = alert.take(slice(first, first + SEARCH_CHUNK))
         problem = problem_of(game, some, bodies)
         first_profiles = (
-            [] if known_table is None else [known_table.stored(problem, HarmCount.of(count))[1] for count in known_table.harm]
+            []
+            if known_table is None
+            else [known_table.stored(problem, HarmCount.of(count))[1] for count in known_table.harm]
         )
         first_profiles += [driven_profiles(problem, game, some, team) for team in teams]
         request = [repr(options).encode(), physics_digest().encode(), problem.identity.tobytes()]

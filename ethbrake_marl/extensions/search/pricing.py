@@ -155,7 +155,7 @@ class Problem(NamedTuple):
     bodies: Ints  # [B] vehicles that are controlled (1: Vehicle 1)
     state: State  # at the first decision; all other vehicles hold ``wanted``
     time_step_s: float
-    count: HarmCount  # what is minimised
+    harm_count: HarmCount  # what is minimised
     aim: float  # WHOLE_LINE, WEIGHTED or LARGEST
     shares: Floats  # [n, 3, N + 1] weights of what a pair's front and rear vehicle share, and of the rear's own amount
     identity: UInt64s  # [n] hash of everything that decides the harm of a profile (``identities``)
@@ -179,7 +179,7 @@ class Problem(NamedTuple):
         return self._replace(state=self.state.take(rows), shares=self.shares[rows], identity=self.identity[rows])
 
     def with_count(self, count: HarmCount) -> Problem:
-        return self._replace(count=count)
+        return self._replace(harm_count=count)
 
     def even_grid(self, number: int) -> Floats:
         """Evenly spaced commands from full braking to full driving, [n, number, B] m/s2."""
@@ -227,13 +227,13 @@ class Problem(NamedTuple):
         ``count``: count of harm; None: the problem's.
         """
         value = np.empty(self.n)
-        worths(last.line, self.shares, (count or self.count).weights, self.aim, value)
+        worths(last.line, self.shares, (count or self.harm_count).weights, self.aim, value)
         return value
 
     def values(self, profiles: Profiles) -> dict[str, Floats]:
-        """What the search minimises if the vehicles follow ``profiles``, in every count of harm: its name -> [n] m2/s2."""
+        """What the search minimises if the vehicles follow ``profiles``: name of a count of harm -> [n] m2/s2."""
         last = self.follow(profiles)
-        return {count.name: self.value(last, count) for count in all_counts(self.count)}
+        return {count.name: self.value(last, count) for count in all_counts(self.harm_count)}
 
     def with_weights(self, weights: Floats, *, largest: bool = False) -> Problem:
         """Problem that minimises the sum of the vehicles' harm times ``weights`` [n, N].

@@ -240,7 +240,7 @@ def prepare_world(problem: Problem, k: int, random: UInt64s, phases: int, stepwi
     """
     state = problem.state
     numbers = np.array([problem.time_step_s, problem.aim, stepwise])
-    weights = np.stack([problem.count.weights, problem.count.tie_breaker.weights])
+    weights = np.stack([problem.harm_count.weights, problem.harm_count.tie_breaker.weights])
     world = World(
         state.car[k], state.clock[k], state.wanted[k].copy(), problem.bodies, problem.bounds[k], problem.shares[k],
         numbers, weights, random[k : k + 1], scratch_for(state.wanted.shape[1]),

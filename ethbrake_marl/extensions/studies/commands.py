@@ -82,7 +82,7 @@ def falsify_command(
             "agent": agent,
             "measure": measure,
             "against": against,
-            "harm_count": weakness.count.name,
+            "harm_count": weakness.harm_count.name,
             "scenario": weakness.scenario.name,
             "settings": list(chosen.texts),
             **about_scenario(weakness.scenario, seed),

@@ -41,7 +41,7 @@ class WeaknessMeasure(NamedTuple):
     scenario: Scenario
     game: Game
     teams: tuple[Team, ...]  # the agent, then the rival if there is one
-    count: HarmCount
+    harm_count: HarmCount
 
     @classmethod
     def of(
@@ -72,11 +72,11 @@ class WeaknessMeasure(NamedTuple):
         Raises ``InvalidInput`` for ``bound`` if the agent has no shield that promises a bound.
         """
         last, *rival_states = (play_to_end(self.game, worlds, team) for team in self.teams)
-        harm = last.harm(self.count)
+        harm = last.harm(self.harm_count)
         if self.name == "harm":
             return WeaknessResult(harm, harm, None)
         shielded = getattr(last.memories.get("shield"), "first", None)  # price of the shield's plan at the alert
-        reference = rival_states[0].harm(self.count) if rival_states else shielded
+        reference = rival_states[0].harm(self.harm_count) if rival_states else shielded
         if reference is None:
             raise InvalidInput(
                 f"agent {self.teams[0].name!r} is not behind a shield that promises a bound at the alert; --measure"
