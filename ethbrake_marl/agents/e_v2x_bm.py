@@ -33,17 +33,17 @@ TIE_MARGIN = 1e-9  # harms (m2/s2) closer than this count as equal
 
 
 def coupled(
-    alert: State, body: int, count: HarmCount = HONEST, horizon_s: float | Floats = 8.0
+    alert: State, body: int, harm_count: AnyCount = HONEST, horizon_s: float | Floats = 8.0
 ) -> ConstantDeceleration:
     """Constant deceleration of vehicle ``body`` that does the least simulated harm, and this harm, in every world.
 
-    All other vehicles hold their commands ``alert.wanted`` [n, N + 1] (m/s2). ``count``: harm to minimise
+    All other vehicles hold their commands ``alert.wanted`` [n, N + 1] (m/s2). ``harm_count``: harm to minimise
     (``episode.counts``). ``horizon_s``: time until which harm counts, one number or [n]. If the deceleration of the
     closed form does no harm, it is the result. Among decelerations of equal harm, the harm in a second count decides
     (``HarmCount.tie_breaker``); then the middle one is the result. Harm has kinks and jumps as a function of the
     deceleration, so a deceleration between two samples of the search may do less harm.
     """
-    until_s = np.full(alert.n, horizon_s, np.float64)
+    count, until_s = HarmCount.of(harm_count), np.full(alert.n, horizon_s, np.float64)
     braking = np.maximum(-alert.wanted, 0.0)
     braking[:, body] = alert.braking_capacity_mps2[:, body - 1]
     best = closed_form(alert, braking, body).deceleration_mps2

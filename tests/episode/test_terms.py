@@ -14,6 +14,7 @@ from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.objectives import amounts, objectives_of
+from ethbrake_marl.episode.counts import HONEST
 from ethbrake_marl.episode.reward import REWARDS, Rewarding, RewardParams, WithoutEffect, reward_params
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import COST, Step
@@ -39,7 +40,7 @@ def paid(reward: dict[str, Any], before: State, after: State, **settings: Any) -
         reward, "total", after.vehicles, LEARNERS, (0.5, 8.0), settings.pop("vector", None)
     )
     step = step_between(before, after, **settings)
-    step.out[COST] = harm = after.harm(step_settings.weights) - before.harm(step_settings.weights)
+    step.out[COST] = harm = after.harm(step_settings.harm_count) - before.harm(step_settings.harm_count)
     compiled = (step_settings.terminal * step.safe_end - step_settings.harm * harm)[:, np.newaxis]
     return rewarding.complete(before, step._replace(reward=np.repeat(compiled, after.vehicles, axis=1)), after)[1]
 
@@ -278,10 +279,17 @@ def test_named_rewards__are_those_of_the_page() -> None:
         "harm": RewardParams(harm=1.0, harm_count="first"),
         "total-harm": RewardParams(harm=1.0, harm_count="total"),
         "honest": RewardParams(harm=1.0, harm_count="honest"),
-        "paper": RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
+        "paper-reward": RewardParams(harm=0.0, harm_count="first", collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
     } == REWARDS
     assert reward_params({"harm": 2, "jerk": 0.5}) == RewardParams(harm=2.0, jerk=0.5)
-    assert reward_params("paper") is REWARDS["paper"]
+    assert reward_params("paper-reward") is REWARDS["paper-reward"]
+    assert (
+        RewardParams(harm=2.0)
+        == RewardParams(harm=2.0, harm_count="honest")
+        == RewardParams(harm=2.0, harm_count=HONEST)
+    )
+    with pytest.raises(InvalidInput, match="^unknown reward 'paper'; renamed to paper-reward$"):
+        reward_params("paper")
 
 
 def one(before: State, step: Step, after: State) -> np.ndarray:

@@ -13,7 +13,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import HARM
+from ethbrake_marl.episode.counts import IMPACT_COUNTS
 from ethbrake_marl.policies.bundle import load_drivers
 from tests.docs.site import load
 from tests.refused import refused
@@ -42,7 +42,7 @@ def test_training__lowers_harm_and_saves_the_policy_that_it_has_evaluated(
     assert policy.manifest.reward["harm"] == 0.05 and policy.manifest.reward["harm_count"] == "first"
     agents = {"mine": f"policy@{tmp_path}", "coasting": "coast"}
     result = eb.evaluate(name, agents, episodes=200, seed=1007)
-    for count, column in HARM.items():
+    for count, column in ((each.name, each.column) for each in IMPACT_COUNTS):
         harm = result["mine"][column].mean()
         np.testing.assert_allclose(harm, best[count], rtol=1e-3)
         assert harm < 0.5 * result["coasting"][column].mean()

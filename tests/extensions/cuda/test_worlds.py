@@ -225,7 +225,7 @@ def test_reward__has_the_weights_of_the_game() -> None:
         ({"seed": -1}, "seed = -1"),
         ({"pool": ("realistic-pair", 3)}, "pool: has 3 worlds of 2 vehicles; must have"),
         ({"pool": ("paper-random", 0)}, "pool: has 0 worlds of 3 vehicles"),
-        ({"reward": "paper"}, "the reward has collision, risk, jerk"),
+        ({"reward": "paper-reward"}, "the reward has collision, risk, jerk"),
         ({"reward": {"harm": 1.0, "shaping": 1.0}}, "the reward has shaping"),
         ({"reward": {"harm": 1.0, "objective": "own"}}, "the reward has harm of single vehicles;"),
         ({"observation": ["own", "contact"]}, "the observation has contact."),

@@ -84,10 +84,7 @@ def test_command__shows_costs_relative_to_full_braking(ethbrake: Command, empty_
     )
     braking, trained = answer["fixed_list"]["results"]
     assert braking["objective"] == pytest.approx(1.0) and trained["objective"] != braking["objective"]
-    assert (
-        answer["next_command"]
-        == "ethbrake evaluate --scenario paper-random --agents full_brake,team@run --set rules=honest"
-    )
+    assert answer["next_command"] == "ethbrake evaluate --scenario paper-random --agents full_brake,team@run"
 
 
 def test_rollout_classification__needs_one_line() -> None:

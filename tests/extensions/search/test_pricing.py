@@ -72,7 +72,7 @@ def test_follow__by_hand() -> None:
 )
 @pytest.mark.parametrize("count", ["first", "total"])
 def test_value__is_the_objective_of_the_controlled_vehicle(objective: str, count: str) -> None:
-    problem, _, last = driven("paper-random-obstacle", objective=objective, count=count)
+    problem, _, last = driven("paper-random-obstacle", objective=objective, harm_count=count)
     expected = amounts(objectives_of(objective, 3), None, last, count)[:, int(problem.bodies[0]) - 1]
     assert problem.value(last) == pytest.approx(expected, rel=1e-12) and (problem.value(last) > 0.0).any()
 
