@@ -55,9 +55,9 @@ def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_h
 def test_honest__adds_nothing_to_a_line_that_brakes_to_rest_and_prices_driving_there() -> None:
     _, game = open_game(REST)
     alert = game.reset(game.draw(1, 0, 0))
-    last, cost = follow_plans(game, alert, np.full((1, 1, 1), -1.0), "honest")
+    last, cost = follow_plans(game, alert, np.full((1, 1, 1), -1.0), HONEST)
     assert last.at_rest.tolist() == [True] and cost.tolist() == [0.0] and not last.line[:, MOVING].any()
-    last, cost = follow_plans(game, alert, np.array([[[0.5], [0.5], [-1.0]]]), "honest")  # 3 m/s2 for 0.2 s
+    last, cost = follow_plans(game, alert, np.array([[[0.5], [0.5], [-1.0]]]), HONEST)  # 3 m/s2 for 0.2 s
     assert last.harm("total").tolist() == [0.0] and cost.tolist() == near([10 * 0.6])
     assert last.borne_harm("honest")[0].tolist() == [0.0, cost[0]]
 
@@ -138,7 +138,7 @@ def test_hold__of_constant_commands_is_the_episode(name: str) -> None:
     tried = shares[:, np.newaxis] * np.where(shares[:, np.newaxis] < 0.0, braking, driving)
     held = hold(state, state.wanted, learners, tried, game.settings.horizon_s, "honest")
     for c, share in enumerate(shares):
-        last, cost = follow_plans(game, state, np.full((N, 1, len(learners)), share), "honest")
+        last, cost = follow_plans(game, state, np.full((N, 1, len(learners)), share), HONEST)
         assert held[0, :, c] == near(cost, rel=1e-7, abs=1e-7)
         assert held[1, :, c] == near(last.harm("first"), rel=1e-7, abs=1e-7)
 
@@ -161,4 +161,6 @@ def test_other_count__is_refused_and_the_three_are_listed(message: str) -> None:
         UNKNOWN[message]()
     for count in COUNTS:
         assert count in str(error.value)
-    assert RewardParams(harm_count="honest").harm_count == "honest"
+    assert (
+        RewardParams(harm_count="honest").harm_count == HONEST and RewardParams().model_dump()["harm_count"] == "honest"
+    )

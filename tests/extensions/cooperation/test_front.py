@@ -7,7 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.team import Team, play_to_end
-from ethbrake_marl.episode.counts import BUILT_IN_COUNTS
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import difference, mean
 from ethbrake_marl.extensions.cooperation.front import (
@@ -97,7 +97,7 @@ def test_agents__that_do_not_observe_the_weights_drive_once() -> None:
 
 
 def test_equal_weights__are_as_good_as_the_tables(front: Front) -> None:
-    known = best_stored(problem_of(eb.open_game(PAPER)[1], sampled()), "first")[0]
+    known = best_stored(problem_of(eb.open_game(PAPER)[1], sampled()), HarmCount.of("first"))[0]
     assert (front.borne["first"][3].sum(axis=1) <= known + 1e-9).all()
 
 

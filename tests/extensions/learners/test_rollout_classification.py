@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.extensions.learners.model import Visited
 from tests.extensions.learners.tiny import PAPER, ROLLOUTS, new_model
@@ -31,7 +32,7 @@ def test_costs__are_those_of_the_moved_learner_in_episodes_driven_so(objective: 
             if step < 3:
                 action[each, moved] += 0.5 * tried[:, way]
             now, _ = model.lines[0].game.step(now, action)
-        harm = amounts(objectives_of(objective, 3), None, now, "total")[each, moved + 1]
+        harm = amounts(objectives_of(objective, 3), None, now, HarmCount.of("total"))[each, moved + 1]
         np.testing.assert_allclose(costs[:, way], harm, rtol=1e-12, atol=1e-12)
     model.recipe = model.recipe.replace(caution=2.0)  # what goes beyond full braking, here the policy
     model._update_current_progress_remaining(1, 2)  # half of it by now

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import HONEST
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.search.best_harm import best_harm, search_list, starting_profiles
@@ -156,7 +157,7 @@ def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_
     assert problem.values(table.profiles["honest"])["honest"].tolist() == table.harm["honest"].tolist()
     table.save(tmp_path / "honest.npz")
     again = BestHarmTable.load(tmp_path / "honest.npz")
-    assert again.stored(problem, "honest")[0].tolist() == table.harm["honest"].tolist() and [*again.harm] == ["honest"]
+    assert again.stored(problem, HONEST)[0].tolist() == table.harm["honest"].tolist() and [*again.harm] == ["honest"]
 
 
 @pytest.mark.parametrize("stepwise", [False, True])
@@ -176,7 +177,7 @@ def test_value__of_the_honest_cost_of_vehicles_is_the_amount_of_the_objective(ob
     problem = problem_of(GAME, sampled(), harm_count="honest", objective=objective)
     last = problem.follow(problem.constant(problem.bounds[:, np.newaxis, :, 1]))
     assert last.line[:, MOVING].any(axis=1).all() and last.line[:, DROVE].any(axis=1).all()
-    assert problem.value(last) == pytest.approx(amounts(objectives_of(objective, 3), None, last, "honest")[:, 1])
+    assert problem.value(last) == pytest.approx(amounts(objectives_of(objective, 3), None, last, HONEST)[:, 1])
 
 
 def test_extremes__are_better_than_constants() -> None:
