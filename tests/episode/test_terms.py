@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agent_names import open_game
-from ethbrake_marl.episode.counts import HONEST
+from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.objectives import amounts, objectives_of
