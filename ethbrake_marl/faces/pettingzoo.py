@@ -59,8 +59,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         scenario: a shipped name, the path or content of a YAML file, or a ``Scenario``.
         render_mode: a mode of ``metadata["render_modes"]``; None: no pictures.
         learners: names of the vehicles that learn; None: the scenario's.
-        reward: ``harm``, ``total-harm``, ``honest``, ``paper``, a mapping of settings, or ``RewardParams``. Under
-            ``harm``, the default, pushing is free; under ``honest`` it hardly pays (``episode.counts``).
+        reward: ``honest``, ``harm``, ``total-harm``, ``paper-reward``, a mapping of settings, or ``RewardParams``.
+            Under ``honest``, the default, pushing hardly pays; under ``harm`` it is free (``episode.counts``).
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
         max_cycles: number of steps after which an episode is truncated, as at a horizon; None: only at the horizon.
