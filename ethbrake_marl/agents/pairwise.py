@@ -181,4 +181,4 @@ def pairwise(alert: State, body: int) -> ConstantDeceleration:
             raise InvalidInput(
                 f"e_v2x_bm:pairwise: {what} in row {np.argmax(wrong)}, where the closed form does not hold"
             )
-    return closed_form(alert, np.ascontiguousarray(capacities(alert.car, BRAKING, alert.time_s)), body)
+    return closed_form(alert, np.ascontiguousarray(capacities(alert.car, BRAKING)), body)

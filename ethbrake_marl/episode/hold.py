@@ -177,7 +177,7 @@ def descend(
     1]) for the others' latest choice. Commands are held until ``until_s``. Returns the commands of all bodies, [n, N +
     1] m/s2, and the harm of the episode, [n] m2/s2.
     """
-    braking = capacities(state.car, BRAKING, state.time_s)
+    braking = capacities(state.car, BRAKING)
     commands, least = -braking, np.zeros(state.n)
     for body in list(bodies) * rounds:
         trials = -braking[:, [body]] * shares

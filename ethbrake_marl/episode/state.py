@@ -157,13 +157,13 @@ class State(NamedTuple):
 
     @property
     def braking_capacity_mps2(self) -> Floats:
-        """Largest deceleration now, [n, N] m/s2."""
-        return capacities(self.car, BRAKING, self.time_s)[:, 1:]
+        """Largest deceleration, [n, N] m/s2."""
+        return capacities(self.car, BRAKING)[:, 1:]
 
     @property
     def driving_capacity_mps2(self) -> Floats:
-        """Largest forward acceleration now, [n, N] m/s2."""
-        return capacities(self.car, DRIVING, self.time_s)[:, 1:]
+        """Largest forward acceleration, [n, N] m/s2."""
+        return capacities(self.car, DRIVING)[:, 1:]
 
     @property
     def mass_t(self) -> Floats:

@@ -41,7 +41,7 @@ class Manifest(FiniteModel):
     """Everything that a policy bundle records, except the tensors."""
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
-    format_version: Literal[2, 4] = 2  # `NetworkSpec.format_version`
+    format_version: Literal[2] = 2
     algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]
     network: NetworkSpec
     observation: ObservationSchema

@@ -75,7 +75,7 @@ class Policy:
         try:
             draft = Manifest(
                 **{"versions": installed_versions(), **manifest}, network=network,
-                format_version=network.format_version, observation=ObservationSchema.of(observation),
+                observation=ObservationSchema.of(observation),
                 weights_sha256=hashlib.sha256(data).hexdigest(), manifest_sha256="0" * 64,
             )  # fmt: skip
             return cls(

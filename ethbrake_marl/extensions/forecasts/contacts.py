@@ -110,9 +110,9 @@ def known_line(line, car, know, time, i, observer_line, parameters, commands):
         parameters[LATENCY, j], commands[j] = 0.0, force if inside else 0.0
         if j == i or force == 0.0:
             parameters[LATENCY, j] = max(car[OWN_LATENCY, j] - time, 0.0)
-            commands[j] = -capacity(car, BRAKING, j, time) if inside else 0.0
+            commands[j] = -capacity(car, BRAKING, j) if inside else 0.0
         elif inside and force < 0.0 and car[BRAKE_RATE, j] < math.inf:
-            commands[j] = -capacity(car, BRAKING, j, time)
+            commands[j] = -capacity(car, BRAKING, j)
     if first == 1 and line[GAP, 0] < FAR_M:
         observer_line[GAP, 0], first = line[GAP, 0], 0
     return first, last
@@ -135,7 +135,7 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
                 for row in range(LINE_ROWS):
                     for j in range(here.shape[1]):
                         here[row, j] = observer_line[row, j]
-                commands[i] = command_of(car[k], i, c - 1.0, clock[k, TIME])
+                commands[i] = command_of(car[k], i, c - 1.0)
                 outcome = move_line(here, parameters, commands, scratch, 0.0, FORECAST_S)
                 if outcome == FAILED:
                     failed = k

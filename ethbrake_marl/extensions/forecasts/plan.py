@@ -94,7 +94,7 @@ def plan_worlds(line, car, clock, know, observers, time_step_s, weights, memory,
                         for j in range(here.shape[1]):
                             here[row, j] = observer_line[row, j]
                     action = min(max(middle + spacing * (c - TRIALS // 2), -1.0), 0.0)
-                    commands[i] = command_of(car[k], i, action, time)
+                    commands[i] = command_of(car[k], i, action)
                     outcome = move_line(here, parameters, commands, scratch, 0.0, FORECAST_S)
                     if outcome == FAILED:
                         failed = k
@@ -114,7 +114,7 @@ def plan_worlds(line, car, clock, know, observers, time_step_s, weights, memory,
             for j in (i, i - 1, i + 1):
                 is_known = max(first, 1) <= j <= last
                 for rate in (BRAKE_RATE, RELEASE_RATE):
-                    value[f] = capacity(car[k], BRAKING, j, time) / car[k, rate, j] if is_known else 0.0
+                    value[f] = capacity(car[k], BRAKING, j) / car[k, rate, j] if is_known else 0.0
                     f += 1
     return failed
 

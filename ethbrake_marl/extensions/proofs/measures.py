@@ -65,10 +65,7 @@ def _controlled_body(game: Game, alert: State, *, together: bool = False) -> int
     """
     learners = game.settings.learners.tolist()
     scripted_bodies = [body for body in range(1, alert.vehicles + 1) if body not in learners]
-    if (
-        game.scripts
-        or (alert.wanted[:, scripted_bodies] != -capacities(alert.car, BRAKING, alert.time_s)[:, scripted_bodies]).any()
-    ):
+    if game.scripts or (alert.wanted[:, scripted_bodies] != -capacities(alert.car, BRAKING)[:, scripted_bodies]).any():
         raise InvalidInput(
             "avoidable, proven_harm, proven_cost: a vehicle that does not learn does not brake fully; all others must"
         )

@@ -90,7 +90,7 @@ class Scene(NamedTuple):
 
     def share(self, body: int) -> float:
         """Command in effect as an action: -1 brakes as hard as the vehicle can, 1 drives as hard as it can."""
-        return float(action_of(self.car, body, self.command(body), self.time_s))
+        return float(action_of(self.car, body, self.command(body)))
 
     def said_of(self, body: int) -> str:
         """What a vehicle does, in words such as "brakes 3.0 m/s2"."""

@@ -306,7 +306,7 @@ def problem_of(
 def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
     """Worlds at the alert in which the vehicles ``bodies`` brake fully, whatever their roles say."""
     wanted = alert.wanted.copy()
-    wanted[:, bodies] = -capacities(alert.car, BRAKING, alert.time_s)[:, bodies]
+    wanted[:, bodies] = -capacities(alert.car, BRAKING)[:, bodies]
     return alert._replace(wanted=wanted)
 
 
