@@ -124,7 +124,6 @@ _EXTRA_OF = {
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("ray", "joblib"), "cluster"),
     "optuna": "tune",
-    "numba_cuda": "cuda",
 }
 
 

@@ -183,17 +183,15 @@ def test_naming_extras__leaves_other_missing_modules_alone() -> None:
     assert not isinstance(caught.value, MissingExtra)
 
 
-def test_extras__are_those_of_the_table_and_all_is_their_sum_without_that_of_gpus() -> None:
+def test_extras__are_those_of_the_table_and_all_is_their_sum() -> None:
     assert {"dev", "docs", "all", *_EXTRA_OF.values()} == set(EXTRAS)
     distribution = {
         "stable_baselines3": "stable-baselines3",
         "pygame": "pygame-ce",
         "imageio_ffmpeg": "imageio-ffmpeg",
         "hydra": "hydra-core",
-        "numba_cuda": "numba-cuda",
     }
     for package, extra in _EXTRA_OF.items():
         names = [re.split(r"[<>=\[]", line)[0] for line in EXTRAS[extra]]
         assert distribution.get(package, package) in map(str.lower, names)
-    whole = [extra for extra in dict.fromkeys(_EXTRA_OF.values()) if extra != "cuda"]
-    assert EXTRAS["all"] == [f"ethbrake-marl[{','.join(whole)}]"]
+    assert EXTRAS["all"] == [f"ethbrake-marl[{','.join(dict.fromkeys(_EXTRA_OF.values()))}]"]

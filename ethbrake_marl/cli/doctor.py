@@ -21,7 +21,7 @@ from ethbrake_marl import __version__
 from ethbrake_marl.cli.command import JsonOption, Out
 from ethbrake_marl.kernel_cache import UNSTORED, cache_folder, delete_damaged, obstacle
 
-EXTRAS = ("train", "report", "marl", "export", "data", "render", "cluster", "tune", "cuda")
+EXTRAS = ("train", "report", "marl", "export", "data", "render", "cluster", "tune")
 
 _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=tried=16", "--set=evaluation.worlds=10")
 

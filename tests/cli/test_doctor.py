@@ -71,7 +71,7 @@ def test_extras__are_those_of_the_page() -> None:
     listed = re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)
     assert sorted(doctor.EXTRAS) == sorted(name for name in listed if name not in ("all", "docs"))
     names = [check.name for check in dict.fromkeys(doctor._dependencies())]
-    assert {"matplotlib", "optuna", "numba-cuda"} <= {*names} and names.count("numpy") == 1
+    assert {"matplotlib", "optuna"} <= {*names} and names.count("numpy") == 1
 
 
 def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings(monkeypatch) -> None:

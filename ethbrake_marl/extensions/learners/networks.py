@@ -52,11 +52,7 @@ class AveragedNetwork(nn.Module):
         self.new_optimizer(rate)
 
     def new_optimizer(self, rate: float) -> None:
-        """Create the optimiser. On a GPU its rate and counters are tensors, so that a CUDA graph can contain it."""
-        weights = [*self.learning.parameters()]
-        on_gpu, device = weights[0].is_cuda, weights[0].device
-        begin = torch.tensor(rate, device=device) if on_gpu else rate
-        self.optimizer = Adam(weights, lr=begin, eps=1e-5, capturable=on_gpu)
+        self.optimizer = Adam(self.learning.parameters(), lr=rate, eps=1e-5)
 
     def descend(self, loss: Tensor, keep: float) -> Tensor:
         self.optimizer.zero_grad()
