@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.motion.interval import move_line, move_lines
 from ethbrake_marl.motion.layout import Bools, Floats, scratch_for
 
@@ -29,7 +29,7 @@ def simulate_again(before: State, after: State, rows: Bools) -> Iterator[tuple[i
     Yields the index of each world, and the scratch memory that the physics has filled (``motion.layout``). There must
     be no decision between the two states.
     """
-    check_exact(before, "a quantity of single impacts")
+    require(before, "a quantity of single impacts", simulates=True)
     scratch = scratch_for(after.vehicles + 1)
     for k in np.flatnonzero(rows).tolist():
         line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))

@@ -15,7 +15,7 @@ from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.agents.team import ESTIMATED, Agent
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import hold_commands
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.estimated import SURPRISE, MedianLine, without_channel
@@ -144,7 +144,6 @@ class EstimatedEV2XBM:
         self.lines: dict[int, MedianLine] = {}  # of each body
 
     def begin(self, alert: State, body: int) -> ChoiceMemory:
-        check_exact(alert, self.name)
         if body not in self.lines:
             self.lines[body] = MedianLine.of(self.scenario, body)
         median = self.lines[body].at_alert(alert, alert)._replace(memories={})
