@@ -34,6 +34,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 AGENT_NAME_PATTERN = re.compile(r"[a-z][a-z0-9_-]*(\.[a-z0-9_-]+)*")
 IN_FILE = re.compile(r"(?P<file>.+?\.py):(?P<name>[A-Za-z_]\w*)(:(?P<argument>[^@]+))?(@(?P<policy>.+))?")
+MODEL_FILE = re.compile(r"[^:@]+\.(zip|pt|pth|onnx|safetensors)")
 PLAIN = re.compile(r"(?P<name>[^:@+]*)(:(?P<argument>[^@]*))?(@(?P<policy>.*))?")
 
 Driver = Agent | Team
@@ -249,6 +250,11 @@ def check_path(path: str | os.PathLike[str]) -> None:
 
 def _make(core: str, settings: AgentSettings) -> Driver:
     """Agent or team for a spec without wrappers."""
+    if MODEL_FILE.fullmatch(core):
+        raise InvalidInput(
+            f"agent {core!r}: is a file; load it: {{'mine': eb.policy_agent(MODEL)}}, where MODEL is PPO.load({core!r})"
+            " or another loaded model; on the command line FILE.py:FUNCTION, a function that returns this agent"
+        )
     in_file = IN_FILE.fullmatch(core)
     match = in_file or PLAIN.fullmatch(core)
     if match is None:

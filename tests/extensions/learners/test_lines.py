@@ -133,7 +133,8 @@ def test_network__begins_as_a_policy_in_its_range_and_as_a_feature_elsewhere() -
 def test_training__starts_from_a_policy_and_a_feature(tmp_path: Path) -> None:
     still = MIXING.replace(
         start="ppo", observation=["own", "front_1", "rear_1", "role", "obstacle", "plan"], total_steps=1,
-        network={"policy": [190, 135, 8], "initial_action": "plan.action"}, learning_rate={"start": 1e-12, "end": 1e-12},
+        network={"policy": [190, 135, 8], "initial_action": "plan.action"},
+        learning_rate={"start": 1e-12, "end": 1e-12},
     )  # fmt: skip
     policy = train(still, LINES, tmp_path / "run", measure=None, on_progress=None).policy
     agents = {"ppo": "ppo", "plan": "plan", "policy": eb.LearnedAgent(policy)}
