@@ -14,7 +14,6 @@ from numbers import Integral
 from pkgutil import resolve_name
 from sysconfig import get_paths
 
-
 _NAMED = 5  # largest number of failed worlds that a message lists one by one
 
 LINE_LIMIT = 1_500  # characters of a message; a longer message is shortened in the middle

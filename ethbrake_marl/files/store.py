@@ -33,7 +33,9 @@ def new_file(path: Path) -> Iterator[Path]:
         with partial.open("rb+") as file:  # Windows cannot flush a file that is open for reading only
             os.fsync(file.fileno())
         os.replace(partial, path)
-    except BaseException:
+    except BaseException as error:
+        if isinstance(error, OSError):
+            error.filename = str(path)
         partial.unlink(missing_ok=True)
         raise
 
