@@ -213,6 +213,10 @@ class CacheFault(UserWarning):
     """The cache of compiled physics code is damaged, or cannot be written, so code is compiled again."""
 
 
+class NoLocks(UserWarning):
+    """The file system of a folder has no locks, so nothing stops a second process from working in the folder."""
+
+
 class IgnoredName(UserWarning):
     """The key ``name`` in a scenario's file differs from the name of the file, which counts."""
 

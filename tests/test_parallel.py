@@ -1,11 +1,9 @@
 """Independent calls: one at a time, in processes, and where joblib's configuration says."""
 
 import os
-import signal
 
 import pytest
 
-from ethbrake_marl import parallel
 from ethbrake_marl.parallel import WorkerLost, run_each
 
 
@@ -27,12 +25,3 @@ def test_process__that_is_killed_is_an_error_and_each_has_one_thread() -> None:
     assert [*run_each(((os.getenv, "OMP_NUM_THREADS") for _ in range(3)), 2)] == ["1"] * 3
     with pytest.raises(WorkerLost, match="use fewer processes"):
         list(run_each([(os._exit, 3)], 2))
-
-
-def test_interrupt__is_blocked_where_the_system_can(monkeypatch: pytest.MonkeyPatch) -> None:
-    with parallel._blocked_interrupt():
-        assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    monkeypatch.delattr(signal, "pthread_sigmask")
-    with parallel._blocked_interrupt():
-        pass  # no error: there is nothing to block

@@ -79,7 +79,7 @@ def ablate_command(
             with_optima,
         )
         from ethbrake_marl.extensions.cooperation.levels import STANDARD, SWEEP_LEVEL, read_levels, sweep_levels
-        from ethbrake_marl.extensions.cooperation.results import tables, write_ablation
+        from ethbrake_marl.extensions.cooperation.results import ablation_results, tables, write_ablation
         from ethbrake_marl.training.recipe import load_recipe
 
         if sweep is not None and len(sweep) > 1:
@@ -107,10 +107,11 @@ def ablate_command(
             if not train_all(plan, jobs or 1, out.show_progress):
                 out.interrupted(f"interrupted; {AFTER_STOPPED_STUDY}")
             measured = with_optima(plan, measure(plan, out.show_progress), jobs or 1, out.show_progress)
-            results, paths = write_ablation(plan, measured)
+            results = ablation_results(plan, measured)
+            with out.writing():
+                out.note(f"results: {', '.join(map(str, write_ablation(plan, measured, results)))}")
         alarms = [Text(line, "bold red") for line in results["undertrained"]]
         out.result(results, *tables(results), results["conditions"], *alarms, in_file=True)
-        out.note(f"results: {', '.join(map(str, paths))}")
 
 
 ABLATE = Part(
@@ -223,9 +224,10 @@ def front_command(
         beside = {"full_brake": full_braking(chosen, drawn_worlds), "maximin": largest}
         results = front_results(front, chosen, drawn_worlds, beside, seed)
         results |= {"budget": budget, "settings": list(settings or ())}
-        output.mkdir(parents=True, exist_ok=True)
-        out.write(output / "front.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
-        out.write(output / "front.png", picture_bytes(front_figure(results), "front.png"), "figure")
+        with out.writing():
+            output.mkdir(parents=True, exist_ok=True)
+            out.write(output / "front.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
+            out.write(output / "front.png", picture_bytes(front_figure(results), "front.png"), "figure")
         out.result(results, front_sheet(results), hypervolume_sheet(results), in_file=True)
         if n < episodes:
             out.interrupted(f"interrupted; the results are those of the first {n:,} worlds")

@@ -147,11 +147,11 @@ def _borne_columns(result: LevelResult, column: str) -> list[Floats]:
     return [result.reached[f"{column}_{i}"] for i in range(1, result.level.scenario.vehicles + 1)]
 
 
-def write_ablation(plan: Ablation, measured: Sequence[LevelResult]) -> tuple[Json, list[Path]]:
-    """Write ``ablation.json``, ``ablation.csv`` and the figure; return the results and the paths of the files."""
+def ablation_results(plan: Ablation, measured: Sequence[LevelResult]) -> Json:
+    """Content of ``ablation.json``."""
     recipes = zip(plan.algorithms, plan.recipes, strict=True)
     swept, machine = plan.levels[0].swept, this_machine()
-    results = {
+    return {
         "settings": {
             **{name: getattr(plan, name) for name in FULL},
             "recipes": {name: recipe.model_dump(mode="json") for name, recipe in recipes},
@@ -163,11 +163,15 @@ def write_ablation(plan: Ablation, measured: Sequence[LevelResult]) -> tuple[Jso
         "conditions": f"{conditions(plan, plan.episodes)} {machine}.",
         **comparison(measured, plan.search_episodes),
     }
+
+
+def write_ablation(plan: Ablation, measured: Sequence[LevelResult], results: Json) -> list[Path]:
+    """Write ``ablation.json``, ``ablation.csv`` and the figure; return the paths of the files."""
     json_file, csv_file, picture = (plan.folder / name for name in (JSON, CSV, FIGURE))
     write_output(json_file, f"{json.dumps(results, indent=2, allow_nan=False)}\n".encode(), force=True)
     write_output(csv_file, levels_csv(measured, plan.search_episodes).encode(), force=True)
     write_picture(picture, ablation_figure(results, conditions(plan, plan.search_episodes)), force=True)
-    return results, [json_file, csv_file, picture]
+    return [json_file, csv_file, picture]
 
 
 def conditions(plan: Ablation, number: int) -> str:

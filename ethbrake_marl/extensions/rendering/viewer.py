@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -92,10 +94,33 @@ def import_pygame(many: bool = False) -> Any:
     return pygame
 
 
+def start_display(many: bool = False) -> Any:
+    """Start the display, and return the module pygame.
+
+    Raises the errors of ``import_pygame``, and ``InvalidInput`` without a display.
+    """
+    pygame = import_pygame(many)
+    with _refusing(pygame):
+        pygame.display.init()
+        if pygame.display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
+            raise pygame.error("there is no display")  # SDL's last resort draws where nobody sees it
+    return pygame
+
+
+@contextmanager
+def _refusing(pygame: Any) -> Iterator[None]:
+    try:
+        yield
+    except pygame.error as error:
+        raise InvalidInput(
+            f"cannot open a window ({error}); render_mode = 'rgb_array' and film files need no display"
+        ) from None
+
+
 class Window(Viewer):
     """Viewer of the mode ``human``: a window that shows every step in real time. The user may close it."""
 
-    check = staticmethod(import_pygame)
+    check = staticmethod(start_display)
 
     def __init__(self, environment: Any) -> None:
         super().__init__(environment)
@@ -138,21 +163,14 @@ class Window(Viewer):
 class Screen:
     """A window of the size of a picture, [H, W, 3].
 
-    Raises ``MissingExtra`` and ``InvalidInput`` as ``import_pygame`` does, and ``InvalidInput`` without a display.
+    Raises the errors of ``start_display``.
     """
 
     def __init__(self, frame: Any) -> None:
-        self.pygame = import_pygame()
+        self.pygame = start_display()
         self.clock = self.pygame.time.Clock()
-        try:
-            self.pygame.display.init()
-            if self.pygame.display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
-                raise self.pygame.error("there is no display")  # SDL's last resort draws where nobody sees it
+        with _refusing(self.pygame):
             self.window = self.pygame.Window("EthBrake", frame.shape[1::-1])
-        except self.pygame.error as error:
-            raise InvalidInput(
-                f"cannot open a window ({error}); render_mode = 'rgb_array' and film files need no display"
-            ) from None
 
     def show(self, frame: Any, fps: int) -> bool:
         """Show a picture for the time of one frame. Return whether the user has left the window open."""
