@@ -200,9 +200,9 @@ def evaluate_teams(
     draw = worlds if isinstance(worlds, DrawnWorlds) else DrawnWorlds.from_state(worlds)
     _check(draw.worlds, agents, game)
     chosen = (*DEFAULT, *measures)
-    alert, n, of_worlds = draw.worlds, draw.worlds.n, columns_of(draw)
-    labels = alert.memories.get(LABELS, {})
-    alert = alert._replace(memories={name: memory for name, memory in alert.memories.items() if name != LABELS})
+    n, of_worlds, labels = draw.worlds.n, columns_of(draw), draw.worlds.memories.get(LABELS, {})
+    memories = {name: memory for name, memory in draw.worlds.memories.items() if name != LABELS}
+    alert = game.marked(draw.worlds._replace(memories=memories))
     for measure in chosen:
         if measure.name in of_worlds or any(name.startswith(f"{measure.name}_") for name in labels):
             raise InvalidInput(f"measure {measure.name!r}: is the name of a column of the worlds; give another name")

@@ -14,7 +14,7 @@ from ethbrake_marl.agent_names import open_game, require_learner, teams_of
 from ethbrake_marl.agents.team import Team, play
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.motion.interval import move_line, move_lines
 from ethbrake_marl.motion.layout import (
@@ -53,7 +53,14 @@ class Impacts:
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """Motion of one world at k times, from the alert to the end of its episode."""
+    """Motion of one world at k times, from the alert to the end of its episode.
+
+    >>> import ethbrake_marl as eb
+    >>> record = eb.record_episode("paper-random", "full_brake", number=1)
+    >>> record.agent, record.gaps_m.shape, len(record.impacts.time_s)
+    ('full_brake', (186, 2), 6)
+
+    """
 
     agent: str
     scenario: str
@@ -158,7 +165,7 @@ def record_agents(
 
 def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> list[EpisodeRecord]:
     """Records of several worlds that a team drives, one per world."""
-    check_exact(worlds, "a record of the motion between decisions")
+    require(game.marked(worlds), "a record of the motion between decisions", simulates=True)
     states = [worlds, *(state for _, state in play(game, worlds, team))]
     return [_record_of([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]
 
@@ -240,7 +247,7 @@ def simulate_again(before: State, after: State, rows: Bools) -> Iterator[tuple[i
 
     Yields the index of each world, and the scratch memory of the physics (``motion.layout``).
     """
-    check_exact(before, "a quantity of single impacts")
+    require(before, "a quantity of single impacts", simulates=True)
     scratch = scratch_for(after.vehicles + 1)
     for k in np.flatnonzero(rows).tolist():
         line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))

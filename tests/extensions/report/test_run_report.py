@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import _EXTRA_OF
+from ethbrake_marl.errors import EXTRA_OF
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.extensions.report.run import TESTS, learners_sheets, other_tests, short_sheet, typical_row_of
 from ethbrake_marl.training.experiment import run_experiment
@@ -170,5 +170,5 @@ def test_evaluate__by_force_leaves_no_file_of_earlier_results(ethbrake: Command,
 
 
 def test_report__is_imported_where_no_package_of_an_extra_can_be() -> None:
-    absent = "".join(f"sys.modules[{name!r}] = None\n" for name in sorted(_EXTRA_OF))
+    absent = "".join(f"sys.modules[{name!r}] = None\n" for name in sorted(EXTRA_OF))
     assert ended(f"import sys\n{absent}from ethbrake_marl.extensions import report") == (0, "", "")
