@@ -65,7 +65,6 @@ SHORT = {  # what is added to a command, the first that fits: the last value of 
     "ethbrake reproduce": "--list",
     "ethbrake study ablate": "--steps 1 --episodes 4 --search-episodes 2 --seeds 1",
     "ethbrake study front": "--episodes 2 --steps 1 --budget 20",
-    "ethbrake study falsify": "--budget 20",
     "python train/ippo.py": "--steps 200 --copies 2 --rollout 60",
     "python train/benchmark/run.py": "--seeds 1 --jobs 1 --decisions 100 --episodes 5",
     "python train/tune.py": "--trials 1 --jobs 1 --set total_steps=1 evaluation.worlds=10",

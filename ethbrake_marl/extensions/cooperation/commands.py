@@ -11,12 +11,26 @@ from rich.text import Text
 
 from ethbrake_marl.cli.command import ForceOption, JobsOption, JsonOption, Out, SettingsOption, example
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.registry import Part
 
 DEFAULT_AGENTS = "e_v2x_bm,universal"  # agents that are compared with the front if the scenario has one learner
 AFTER_STOPPED_STUDY = "the same command continues the work in this folder"
 
 
+study_group = typer.Typer(
+    rich_markup_mode=None,
+    add_completion=False,
+    help="Compare levels of cooperation, and choices of whose harm counts.",
+    epilog=example("study ablate --quick --output runs/ablation-quick", "study front --output runs/front"),
+)
+
+
+@study_group.command(
+    "ablate",
+    epilog=example(
+        "study ablate --quick --output runs/ablation-quick",
+        "study ablate --sweep objective=social:0..90:15 --output runs/angle",
+    ),
+)
 def ablate_command(
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")],
     levels: Annotated[
@@ -114,15 +128,13 @@ def ablate_command(
         out.result(results, *tables(results), results["conditions"], *alarms, in_file=True)
 
 
-ABLATE = Part(
-    ablate_command,
+@study_group.command(
+    "front",
     epilog=example(
-        "study ablate --quick --output runs/ablation-quick",
-        "study ablate --sweep objective=social:0..90:15 --output runs/angle",
+        "study front --output runs/front",
+        "study front --weights 1,1,1 --weights 4,1,1 --agents vine-preference --output runs/two",
     ),
 )
-
-
 def front_command(
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")],
     scenario: Annotated[
@@ -231,12 +243,3 @@ def front_command(
         out.result(results, front_sheet(results), hypervolume_sheet(results), in_file=True)
         if n < episodes:
             out.interrupted(f"interrupted; the results are those of the first {n:,} worlds")
-
-
-FRONT_PART = Part(
-    front_command,
-    epilog=example(
-        "study front --output runs/front",
-        "study front --weights 1,1,1 --weights 4,1,1 --agents vine-preference --output runs/two",
-    ),
-)

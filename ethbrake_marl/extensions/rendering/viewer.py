@@ -73,10 +73,9 @@ class Words(Viewer):
 
 
 def import_pygame(many: bool = False) -> Any:
-    """Import pygame from the package pygame-ce, which draws the window of one world.
+    """Import pygame of the package pygame-ce. Raises ``MissingExtra`` without it.
 
-    Raises ``MissingExtra`` if it is not installed, and ``InvalidInput`` if ``many`` (there is no window for many
-    worlds), or if the installed module is an old pygame-ce or belongs to the package pygame.
+    Raises ``InvalidInput`` for ``many`` worlds, which have no window, for an old pygame-ce, and for the package pygame.
     """
     if many:
         raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
@@ -142,7 +141,7 @@ class Window(Viewer):
         """Do nothing: the window shows every step by itself."""
 
     def _play(self) -> None:
-        """Show the last time step in the window, in real time. Open the window first; stop if the user closes it."""
+        """Show the last time step in real time. Open the window first; stop if the user closes it."""
         for frame in [] if self.closed else self.step_frames():
             if self.window is None:
                 self.window = Screen(frame)
@@ -173,7 +172,7 @@ class Screen:
             self.window = self.pygame.Window("EthBrake", frame.shape[1::-1])
 
     def show(self, frame: Any, fps: int) -> bool:
-        """Show a picture for the time of one frame. Return whether the user has left the window open."""
+        """Show a picture for the time of one frame. Return whether the window is still open."""
         pygame = self.pygame
         picture = pygame.image.frombuffer(frame.tobytes(), frame.shape[1::-1], "RGB")
         self.window.get_surface().blit(picture, (0, 0))
