@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from ethbrake_marl.lazy_imports import names_behind
 from ethbrake_marl.faces.registration import register_environments
 from ethbrake_marl.errors import naming_extras
-from ethbrake_marl.renamed import new_name
 
 if TYPE_CHECKING:
     # Environments
@@ -60,10 +59,10 @@ if TYPE_CHECKING:
     from ethbrake_marl.progress import Progress as Progress
 
     # Evaluation
-    from ethbrake_marl.evaluation.door import evaluate as evaluate
+    from ethbrake_marl.evaluation.evaluate import evaluate as evaluate
     from ethbrake_marl.evaluation.evaluate import Result as Result
     from ethbrake_marl.evaluation.record import EpisodeRecord as EpisodeRecord, record_episode as record_episode
-    from ethbrake_marl.evaluation.summary_row import SummaryRow as SummaryRow
+    from ethbrake_marl.evaluation.summary import SummaryRow as SummaryRow
     from ethbrake_marl.evaluation.summary import (
         SummaryTable as SummaryTable,
         summarise as summarise,
@@ -77,7 +76,7 @@ if TYPE_CHECKING:
 
     # Your own parts
     from ethbrake_marl.agent_names import register_agent as register_agent, register_shield as register_shield
-    from ethbrake_marl.evaluation.named_measures import register_measure as register_measure
+    from ethbrake_marl.evaluation.measure_registry import register_measure as register_measure
     from ethbrake_marl.episode.terms import register_term as register_term
     from ethbrake_marl.training.recipe import register_algorithm as register_algorithm
     from ethbrake_marl.episode.objectives import register_objective as register_objective
@@ -111,7 +110,7 @@ def _import_public(name: str) -> Any:
         if find_spec(folder) is not None and find_spec(f"{folder}.{name}") is not None:
             return import_module(f"{folder}.{name}")
         close = ["parallel_env"] if name in ("make", "make_env") else get_close_matches(name, _HOMES, n=1)
-        hint = new_name("attribute", name) or (f"did you mean {close[0]!r}?" if close else "")
+        hint = f"did you mean {close[0]!r}?" if close else ""
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint and '; '}{hint}")
     register_environments()
     with naming_extras():

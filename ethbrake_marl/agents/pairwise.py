@@ -17,13 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.episode.departures import MAP, OBSTACLE
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.contact import contact
 from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.impact import TOUCH_MPS
-from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, GAP, LATENCY, RELEASE_RATE, SPEED, Floats
+from ethbrake_marl.motion.layout import BRAKING, GAP, LATENCY, SPEED, Floats
 
 CLOSED_FORM_CANDIDATES = 9
 RELATIVE_TIE = 1e-12  # harms closer than this, relative to 1 + harm, count as equal
@@ -162,14 +162,8 @@ def closed_form(alert: State, braking: Floats, body: int) -> ConstantDeceleratio
 def pairwise(alert: State, body: int) -> ConstantDeceleration:
     """Deceleration of vehicle ``body`` (1: Vehicle 1) that minimises the predicted harm H, and H, in every world.
 
-    Of equally good decelerations the middle one. An obstacle is ignored. Raises ``InvalidInput`` where the proof does
-    not hold: a vehicle moves backward, or brakes build up gradually.
+    Of equally good decelerations the middle one. An obstacle is ignored. Raises ``InvalidInput`` for worlds that depart
+    from the plain game other than by an obstacle or the paper's map.
     """
-    backward = (alert.speeds_mps < 0.0).any(axis=1)
-    builds = np.isfinite(alert.car[:, [BRAKE_RATE, RELEASE_RATE], 1:]).any(axis=(1, 2))
-    for wrong, what in ((backward, "a vehicle moves backward"), (builds, "brakes build up gradually")):
-        if np.any(wrong):
-            raise InvalidInput(
-                f"e_v2x_bm:pairwise: {what} in row {np.argmax(wrong)}, where the closed form does not hold"
-            )
+    require(alert, "e_v2x_bm:pairwise", {OBSTACLE, MAP})
     return closed_form(alert, np.ascontiguousarray(capacities(alert.car, BRAKING)), body)

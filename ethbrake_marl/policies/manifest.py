@@ -23,7 +23,7 @@ from ethbrake_marl.registry import versions_used
 
 LONGEST_STEP_S = 1e6
 POLICY_PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "stable-baselines3", "torch")
-PHYSICS_KEY = "physics"  # key of `versions`: digest of the physics; files of earlier versions lack it
+PHYSICS_KEY = "physics"  # key of `versions`: digest of the physics
 
 Learner = Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")]
 

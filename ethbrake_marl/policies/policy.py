@@ -100,7 +100,7 @@ class Policy:
 
 
 def _manifest_sha256(manifest: Manifest) -> str:
-    return content_sha256(manifest.model_dump(mode="json"))  # keys of earlier versions are not written
+    return content_sha256(manifest.model_dump(mode="json"))
 
 
 def serialise(tensors: Mapping[str, Float32s]) -> bytes:

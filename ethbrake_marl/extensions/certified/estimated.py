@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.messages.belief import known_pieces
 from ethbrake_marl.extensions.messages.links import (
@@ -140,8 +141,10 @@ class MedianLine(NamedTuple):
         """Median lines at the alert with what the vehicle knows at the first decision ``state``, one for each world of
         ``alert``.
 
-        Vehicles that are completely known by then start as in ``alert``, and so do the gaps between them.
+        Vehicles that are completely known by then start as in ``alert``, and so do the gaps between them. Raises
+        ``InvalidInput`` for worlds that depart from what the vehicle can estimate.
         """
+        require(alert, "an estimated line", SHOWN)
         news = self.received(state)
         known = np.asarray(news.pieces[:, :, :P_INTENT].all(axis=2))
         known[:, 0] = known[:, 1]

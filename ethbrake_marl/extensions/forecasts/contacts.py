@@ -13,8 +13,9 @@ import math
 import numpy as np
 
 from ethbrake_marl.episode.commands import command_of
+from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.features import Feature
-from ethbrake_marl.episode.state import TIME, State, check_exact
+from ethbrake_marl.episode.state import TIME, State, require
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacity
@@ -180,7 +181,7 @@ def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
 
     Raises ``PhysicsError`` if a simulation fails.
     """
-    check_exact(state, "a forecast of contacts")
+    require(state, "a forecast of contacts", SHOWN)
     bodies = state.wanted.shape[1]
     out = np.empty((state.n, len(observers), len(CONTACT) + len(CONTACT_FAR)))
     line, observer_line, parameters = (np.zeros((rows, bodies)) for rows in (LINE_ROWS, LINE_ROWS, CAR_ROWS))

@@ -19,10 +19,11 @@ import numpy as np
 
 from ethbrake_marl.episode.commands import command_of, commands_of
 from ethbrake_marl.episode.counts import amount_so_far, weights_of
+from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
 from ethbrake_marl.episode.observe import View
-from ethbrake_marl.episode.state import TIME, State, check_exact
+from ethbrake_marl.episode.state import TIME, State, require
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.forecasts.contacts import (
@@ -136,7 +137,7 @@ def middle_of_least(costs):
 
 def _plans(state: State, observers: Ints, time_step_s: float) -> Floats:
     """Features ``plan`` before scaling, [n, observers, F]. Raises ``PhysicsError`` if a simulation fails."""
-    check_exact(state, "a plan")
+    require(state, "a plan", SHOWN)
     bodies = state.wanted.shape[1]
     out = np.empty((state.n, len(observers), len(PLAN)))
     line, observer_line, parameters = (np.zeros((rows, bodies)) for rows in (LINE_ROWS, LINE_ROWS, CAR_ROWS))

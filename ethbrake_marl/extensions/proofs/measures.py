@@ -51,7 +51,8 @@ def proven_cost(game: Game, alert: State, last: State) -> MeasureValue:
 def _bound(game: Game, alert: State, count: str) -> LowerBound:
     body, settings = _controlled_body(game, alert), game.settings
     ends = np.array([body, settings.horizon_s, settings.time_step_s])
-    request = ends.tobytes() + alert.line.tobytes() + alert.car.tobytes()
+    departures = " ".join(sorted(alert.departures)).encode()  # a stored bound must not pass worlds that are refused
+    request = departures + ends.tobytes() + alert.line.tobytes() + alert.car.tobytes()
     if request != _bound_cache.get(count, (b"",))[0]:
         bound = lower_bound(alert, body, count=count, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s)
         _bound_cache[count] = request, bound
