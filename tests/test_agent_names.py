@@ -89,7 +89,7 @@ def test_a_script__has_the_name_that_it_was_asked_for_by(spec: str):
         (None, "must be a name"),
         ("a@", "a path must follow '@'"),
         ("a b", "unknown agent 'a b'"),
-        ("runs/mine.zip", "agent 'runs/mine.zip': is a file; load it: {'mine': eb.policy_agent(MODEL)}, where MODEL"),
+        ("runs/mine.zip", "agent 'runs/mine.zip': is a file; load it: "),
         ("A", "unknown agent 'A'"),
     ],
 )
