@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.pairwise import ConstantDeceleration, closed_form, pairwise
-from ethbrake_marl.agents.team import MODEL, NO_BODIES, STATE
+from ethbrake_marl.agents.team import NO_BODIES
 from ethbrake_marl.episode.hold import hold
+from ethbrake_marl.episode.layer import MODEL, STATE
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import StepSettings, failure, first_decision, step
 from ethbrake_marl.errors import InvalidInput

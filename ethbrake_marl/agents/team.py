@@ -10,19 +10,12 @@ import numpy as np
 
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game, Script, Shield
-from ethbrake_marl.episode.layer import MESSAGES, SENSORS
+from ethbrake_marl.episode.layer import KNOWLEDGE, UNSTATED
 from ethbrake_marl.episode.script_calls import ask_script, begin_script, guard_scripts
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Floats
-
-# what an agent needs to know, after `episode.layer.SENSORS` and `MESSAGES`
-ESTIMATED = "estimated model"  # also what the scenario says about all worlds: ranges of values, scripts, physics
-STATE = "true state"  # also gaps, speeds, capacities and latencies of all vehicles, whether received or not
-MODEL = "true model"  # also masses, restitution and scripts: everything that an exact simulation needs
-KNOWLEDGE = (SENSORS, MESSAGES, ESTIMATED, STATE, MODEL)
-UNSTATED = "not stated"
 
 NO_BODIES = np.zeros(0, np.int64)
 CHUNK = 2_500  # worlds of a list that are driven together, to limit memory
@@ -50,7 +43,10 @@ class Agent(Script, Protocol):
 
     @property
     def knows(self) -> str:
-        """What the agent needs to know, for tables: one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
+        """What the agent needs to know: one of the texts of ``episode.layer.KNOWLEDGE``, or ``UNSTATED``.
+
+        Layers filter what it sees unless it claims more than its vehicle receives.
+        """
 
 
 class Team(NamedTuple):
@@ -137,11 +133,11 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
         raise InvalidInput(f"team = {team!r:.60}: must be a Team, for instance Team.of({{'vehicle_2': agent}}, 'mine')")
     game = team.game(game)
     if game.shield is None:
-        state, agents, actions = game.reset(alert), game.agents(guard_scripts(team.drivers)), np.zeros((alert.n, 0))
-        memories = {body: begin_script(agent, alert, body) for body, agent in agents.items()}
+        state, drivers, actions = game.reset(alert), guard_scripts(team.drivers), np.zeros((alert.n, 0))
+        memories = {body: begin_script(agent, alert, body) for body, agent in game.agents(drivers).items()}
         state = state._replace(memories={**state.memories, **memories})
         # From the first decision on, the learners' agents decide as scripts do.
-        game = game._replace(scripts={**game.scripts, **agents}, settings=game.settings._replace(learners=NO_BODIES))
+        game = game._replace(scripts={**game.scripts, **drivers}, settings=game.settings._replace(learners=NO_BODIES))
     else:
         state, actions = game.reset(alert), None
     yield None, state

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.team import CHUNK, KNOWLEDGE, MODEL, UNSTATED, Team, check_knows, play
+from ethbrake_marl.agents.team import CHUNK, Team, check_knows, play
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import KNOWLEDGE, MODEL, UNSTATED
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation.identity import policy_digests, versions, worlds_sha256
@@ -170,7 +171,7 @@ def evaluate_teams(
         {team: _join_columns([part[team] for part in parts]) for team in agents},
         {**columns, "hidden": hidden_from(alert, game)},
         chosen,
-        {name: known_by(team) for name, team in agents.items()},
+        {name: known_by(team, game) for name, team in agents.items()},
         {name: {f"vehicle_{i}": agent.name for i, agent in team.drivers.items()} for name, team in agents.items()},
         {name: policy_digests(team.drivers) for name, team in agents.items()},
         {
@@ -248,9 +249,11 @@ def hidden_from(alert: State, game: Game) -> Bools:
     return hidden
 
 
-def known_by(team: Team) -> str:
-    """What a team must know, in words such as ``messages + true model``."""
-    return " + ".join(word for word in (*KNOWLEDGE, UNSTATED) if word in _knowledge_of(team).values())
+def known_by(team: Team, game: Game) -> str:
+    """What a team must know, in words such as ``messages + true model``; with ``filtered`` if it does not say."""
+    knowledge = _knowledge_of(team).values()
+    silent = f"{UNSTATED}, filtered" if game.layers else UNSTATED
+    return " + ".join([*(word for word in KNOWLEDGE if word in knowledge), *[silent] * (UNSTATED in knowledge)])
 
 
 def _knowledge_of(team: Team) -> dict[str, str]:

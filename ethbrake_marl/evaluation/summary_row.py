@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ethbrake_marl.agents.team import MODEL, STATE
+from ethbrake_marl.episode.layer import MODEL, STATE
 from ethbrake_marl.errors import unknown_name
 from ethbrake_marl.files.sheet import Estimate
 

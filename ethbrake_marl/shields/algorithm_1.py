@@ -15,10 +15,11 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
-from ethbrake_marl.agents.team import MODEL, Agent, propose
+from ethbrake_marl.agents.team import Agent, propose
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.script_calls import begin_script
 from ethbrake_marl.episode.state import END, State

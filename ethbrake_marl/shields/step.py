@@ -37,9 +37,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.team import MODEL, Agent, propose
+from ethbrake_marl.agents.team import Agent, propose
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.play import follow_plans
 from ethbrake_marl.episode.script_calls import begin_script
 from ethbrake_marl.episode.state import State, take

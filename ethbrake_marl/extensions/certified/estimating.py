@@ -13,8 +13,9 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
-from ethbrake_marl.agents.team import ESTIMATED, Agent
+from ethbrake_marl.agents.team import Agent
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import ESTIMATED
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import hold_commands
 from ethbrake_marl.errors import InvalidInput

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agent_names import AgentSettings, make_agent
-from ethbrake_marl.agents.team import MODEL, Agent, Team
+from ethbrake_marl.agents.team import Agent, Team
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.extensions.search.best_harm import SEARCH_BUDGET, agent_commands, e_v2x_bm_profiles
