@@ -60,10 +60,10 @@ if TYPE_CHECKING:
     from ethbrake_marl.progress import Progress as Progress
 
     # Evaluation
-    from ethbrake_marl.evaluation.door import evaluate as evaluate
+    from ethbrake_marl.evaluation.evaluate import evaluate as evaluate
     from ethbrake_marl.evaluation.evaluate import Result as Result
     from ethbrake_marl.evaluation.record import EpisodeRecord as EpisodeRecord, record_episode as record_episode
-    from ethbrake_marl.evaluation.summary_row import SummaryRow as SummaryRow
+    from ethbrake_marl.evaluation.summary import SummaryRow as SummaryRow
     from ethbrake_marl.evaluation.summary import (
         SummaryTable as SummaryTable,
         summarise as summarise,
@@ -77,7 +77,7 @@ if TYPE_CHECKING:
 
     # Your own parts
     from ethbrake_marl.agent_names import register_agent as register_agent, register_shield as register_shield
-    from ethbrake_marl.evaluation.named_measures import register_measure as register_measure
+    from ethbrake_marl.evaluation.measure_registry import register_measure as register_measure
     from ethbrake_marl.episode.terms import register_term as register_term
     from ethbrake_marl.training.recipe import register_algorithm as register_algorithm
     from ethbrake_marl.episode.objectives import register_objective as register_objective

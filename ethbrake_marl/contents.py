@@ -23,10 +23,10 @@ CONTENTS = {
     "shields": {"step": "shields.step:STEP", "episode": "shields.algorithm_1:EPISODE"},
     "terms": {"intervention": "shields.shield:intervention"},
     "measures": {
-        "worst5": "evaluation.worst:WORST5",
-        "pushed_mps": "evaluation.pushing:PUSHED_MPS",
-        "pushed_m": "evaluation.pushing:PUSHED_M",
-        "drove_towards": "evaluation.pushing:DROVE_TOWARDS",
-        "still_moving": "evaluation.pushing:STILL_MOVING",
+        "worst5": "evaluation.measures:WORST5",
+        "pushed_mps": "evaluation.measures:PUSHED_MPS",
+        "pushed_m": "evaluation.measures:PUSHED_M",
+        "drove_towards": "evaluation.measures:DROVE_TOWARDS",
+        "still_moving": "evaluation.measures:STILL_MOVING",
     },
 }

@@ -23,7 +23,7 @@ from ethbrake_marl.files.store import check_folder
 
 if TYPE_CHECKING:
     from ethbrake_marl.cli.settings import CommandSettings
-    from ethbrake_marl.evaluation.compared import Compared
+    from ethbrake_marl.evaluation.comparison import Comparison
 
 GROUP_EPISODES = 2_000  # worlds of each scenario of a group, except the three tests
 REPORT = "report.html"
@@ -101,24 +101,24 @@ def evaluate_command(
 def _compare(
     out: Out, scenario: str, chosen: CommandSettings, agents: str, episodes: int, seed: int, jobs: int | None, *,
     is_benchmark: bool,
-) -> Compared:  # fmt: skip
+) -> Comparison:  # fmt: skip
     from ethbrake_marl.agent_names import teams_of
     from ethbrake_marl.evaluation.benchmark import COUNT, benchmark_measures
-    from ethbrake_marl.evaluation.compared import Compared
+    from ethbrake_marl.evaluation.comparison import Comparison
 
     loaded = chosen.change_scenario(scenario)
     harm_count = chosen.command.get("harm_count", COUNT if is_benchmark else "first")
     measures = chosen.command.get("measures", "")
     if is_benchmark:
         measures = ",".join(filter(None, [measures, *benchmark_measures(loaded, episodes=episodes, seed=seed)]))
-    return Compared.of(
+    return Comparison.of(
         loaded, teams_of(agents, loaded, harm_count=harm_count), episodes=episodes, seed=seed, harm_count=harm_count,
         measures=measures, jobs=jobs or 1, on_done=lambda worlds: out.progress("worlds", worlds, episodes),
     )  # fmt: skip
 
 
 def _show(
-    out: Out, comparisons: dict[str, Compared], output: Path | None, per_world: Any, page: str, *, is_benchmark: bool
+    out: Out, comparisons: dict[str, Comparison], output: Path | None, per_world: Any, page: str, *, is_benchmark: bool
 ) -> None:
     """Write the results to the folder ``output``, if there is one, and print them."""
     from ethbrake_marl.evaluation.benchmark import benchmark_rows, benchmark_sheet

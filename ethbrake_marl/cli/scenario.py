@@ -15,7 +15,7 @@ from ethbrake_marl.cli.pages import page_function
 from ethbrake_marl.files.sheet import Sheet
 
 if TYPE_CHECKING:
-    from ethbrake_marl.evaluation.trial import Trial
+    from ethbrake_marl.cli.trial import Trial
     from ethbrake_marl.worlds.scenario import Scenario
 
 TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # worlds that `scenario sample` draws for a table and for a picture
@@ -64,7 +64,7 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
     learner knows, and whether there is anything to learn: the harm of full braking, of the best constant deceleration,
     and of the best known commands. A mixture of lines is tried line by line.
     """
-    from ethbrake_marl.evaluation.trial import try_scenario
+    from ethbrake_marl.cli.trial import try_scenario
     from ethbrake_marl.worlds.catalogue import load_scenario
 
     with Out(as_json=as_json) as out:
@@ -191,7 +191,7 @@ def scenario_parts(as_json: JsonOption = False) -> None:
     from ethbrake_marl.episode.features import FEATURES, GROUPS, WHOLE_GROUPS
     from ethbrake_marl.episode.objectives import OBJECTIVES
     from ethbrake_marl.episode.terms import BUILT_IN, TERMS
-    from ethbrake_marl.evaluation.named_measures import DEFAULT_MEASURES, MEASURES
+    from ethbrake_marl.evaluation.measure_registry import DEFAULT_MEASURES, MEASURES
     from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
     from ethbrake_marl.worlds.channel import PRESETS
 

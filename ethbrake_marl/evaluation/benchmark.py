@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ethbrake_marl.evaluation.door import SEED, evaluate
-from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.evaluation.named_measures import MEASURES
+from ethbrake_marl.evaluation.evaluate import SEED, Result, evaluate
+from ethbrake_marl.evaluation.measure_registry import MEASURES
 from ethbrake_marl.evaluation.summary import SummaryTable
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.registry import DISTRIBUTION

@@ -1,4 +1,4 @@
-"""Evaluate teams: every team drives every world once, and measures turn episodes into columns.
+"""``eb.evaluate``: every team drives every world once, and measures turn episodes into columns.
 
 The worlds are fixed in advance. Counting the episodes that finish first would favour short ones, often with impacts.
 """
@@ -12,20 +12,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.agent_names import open_game, require_learner, teams_of
 from ethbrake_marl.agents.team import CHUNK, Team, check_knows, play
+from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import KNOWLEDGE, MODEL, UNSTATED
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
-from ethbrake_marl.evaluation.identity import policy_digests, versions, worlds_sha256
+from ethbrake_marl.evaluation.measure_registry import measures_called
 from ethbrake_marl.evaluation.measures import DEFAULT, Measure, MeasureValues, Watch, measure_columns, naming
+from ethbrake_marl.evaluation.provenance import about_scenario, policy_digests, versions, worlds_sha256
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.worlds.describe import clusters_of, columns_of
+from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.sampling import DrawnWorlds
 
 Columns = dict[str, MeasureValues]
+
+EPISODES, SEED = 10_000, 7  # the evaluation list
 
 
 @dataclass(frozen=True)
@@ -111,6 +117,72 @@ class Result:
         return DataFrame(self.arrays())
 
 
+def evaluate(
+    worlds: AnyScenario | DrawnWorlds | State | None = None,
+    agents: Any = "full_brake,e_v2x_bm",
+    *,
+    scenario: AnyScenario | None = None,
+    episodes: int | None = None,
+    seed: int | None = None,
+    harm_count: str = "first",
+    measures: Iterable[str] | str = (),
+    jobs: int = 1,
+    on_done: Callable[[int], None] | None = None,
+) -> Result:
+    """Let agents drive the same worlds, each agent once in every world.
+
+    ``eb.evaluate("paper-random", "full_brake,ppo+step")`` is the shortest form. Results have the same bits for any
+    number of processes.
+
+    Args:
+        worlds: a scenario, from whose evaluation list the worlds are taken (a shipped name, the path or content of a
+            file, or a ``Scenario``); or worlds at the alert, together with ``scenario``.
+        agents: names of agents; or a mapping whose keys name the rows of the result, and whose values are names,
+            agents, or mappings from vehicles to agents: ``{"mine": agent, "both": {"vehicle_2": agent, "vehicle_3":
+            "coast"}}``.
+        scenario: scenario to which ``worlds`` belong, if they are worlds at the alert.
+        episodes: number of worlds from the evaluation list; None: 10,000.
+        seed: seed of the evaluation list; None: 7.
+        harm_count: what optimising agents minimise: ``first``, as in the paper, ``total``, or ``honest``, under which
+            pushing hardly pays (``episode.counts``).
+        measures: names of further measures (``evaluation.measure_registry``).
+        jobs: number of processes.
+        on_done: function that is called with the number of worlds driven so far.
+
+    Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for any other mistake.
+
+    >>> import ethbrake_marl as eb
+    >>> result = eb.evaluate("paper-random", "full_brake", episodes=3)
+    >>> result["full_brake"]["total_harm"].round(2)
+    array([33.79, 77.19,  0.  ])
+
+    """
+    test_worlds = None
+    if isinstance(worlds, DrawnWorlds | State):
+        test_worlds = worlds
+    elif worlds is not None:
+        if scenario is not None:
+            raise InvalidInput("evaluate: scenario: is given twice; leave one of the two out")
+        scenario = worlds
+    if scenario is None:
+        if test_worlds is not None:
+            raise InvalidInput("evaluate: worlds need their scenario, for instance scenario='paper-random'")
+        scenario = "paper-random"
+    if test_worlds is not None and (episodes, seed) != (None, None):
+        raise InvalidInput("evaluate: episodes and seed choose worlds of a list; leave them out if worlds are given")
+    episodes, seed = EPISODES if episodes is None else episodes, SEED if seed is None else seed
+    check_count("evaluate: harm_count", harm_count)
+    loaded, game = open_game(scenario)
+    require_learner(loaded)
+    about = about_scenario(loaded, None if test_worlds is not None else seed)
+    if test_worlds is None:
+        check_whole_number("episodes", episodes, 1)
+        test_worlds = loaded.draw(int(episodes), seed)
+    teams = teams_of(agents, loaded, harm_count=harm_count)
+    about["agent_settings"] = {"harm_count": harm_count}
+    return evaluate_teams(test_worlds, teams, game, measures_called(measures or ()), jobs, about=about, on_done=on_done)
+
+
 def evaluate_teams(
     worlds: DrawnWorlds | State,
     agents: Mapping[str, Team],
@@ -129,7 +201,7 @@ def evaluate_teams(
         game: game of the worlds' scenario.
         measures: further measures, for instance ``measures_called("pushed_m,pushed_mps")``.
         jobs: number of processes.
-        about: entries to add to ``Result.about``, usually those of ``identity.about_scenario``.
+        about: entries to add to ``Result.about``, usually those of ``provenance.about_scenario``.
         on_done: function that is called with the number of worlds that all teams have driven so far.
 
     Raises ``InvalidInput`` for worlds that are not at the alert, for worlds or a team that do not fit the game, for

@@ -1,11 +1,9 @@
-"""Record one episode with closely spaced samples, for figures and viewers.
-
-The motion between two decisions is computed again from the state at the first one.
-"""
+"""The motion between decisions, simulated again: records of episodes for figures and viewers, times of impacts."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -15,9 +13,9 @@ from ethbrake_marl.agents.team import Team, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.evaluation.pushing import with_post
-from ethbrake_marl.evaluation.resimulation import advance_worlds
+from ethbrake_marl.motion.interval import move_line, move_lines
 from ethbrake_marl.motion.layout import (
+    FAR_M,
     FIRST,
     FORCE,
     GAP,
@@ -27,12 +25,14 @@ from ethbrake_marl.motion.layout import (
     NEXT_TIME,
     SPEED,
     TOTAL,
+    Bools,
     Floats,
     Ints,
     scratch_for,
 )
 
 SAMPLE_S = 0.02  # usual time between two samples
+POST_M = 1e5  # distance to an imaginary post that no vehicle reaches; its gap gives distances to 1e-10 m
 
 
 @dataclass(frozen=True)
@@ -172,3 +172,39 @@ def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impac
     order = np.argsort(firsts[:, 0], kind="stable")
     first, total, number = increase[piece, :, pair][order].T
     return Impacts(firsts[order, 0], pair[order], firsts[order, 1], number.astype(np.int64), first, total)
+
+
+def with_post(state: State) -> Floats:
+    """Copy of ``state.line`` with an imaginary post far ahead of Vehicle 1, except in worlds with an obstacle.
+
+    The gap ahead of Vehicle 1 then shows how far the vehicle moves.
+    """
+    line = state.line.copy()
+    line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
+    return line
+
+
+def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wanted: Floats, scratch: Floats) -> int:
+    """Advance every world from ``time`` to ``until`` (s, [n] each); change ``line`` in place.
+
+    Returns the index of a world in which the simulation failed, or -1. All vehicles hold the commands ``wanted`` [n, N
+    + 1] (m/s2); the other arrays are described in ``motion.layout``.
+    """
+    moved = line.copy()  # arrays of any layout become alike, because a kernel is compiled for each layout
+    failed: int = move_lines(moved, car.copy(), time.copy(), until.copy(), wanted.copy(), scratch)
+    line[:] = moved
+    return failed
+
+
+def simulate_again(before: State, after: State, rows: Bools) -> Iterator[tuple[int, Floats]]:
+    """Simulate the worlds in the mask ``rows`` [n] again, from ``before`` to ``after``, one after the other.
+
+    Yields the index of each world, and the scratch memory that the physics has filled (``motion.layout``). There must
+    be no decision between the two states.
+    """
+    check_exact(before, "a quantity of single impacts")
+    scratch = scratch_for(after.vehicles + 1)
+    for k in np.flatnonzero(rows).tolist():
+        line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))
+        move_line(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
+        yield k, scratch

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from textwrap import fill
 from typing import Any, Literal
 
@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.counts import COLUMN
-from ethbrake_marl.errors import InvalidInput, naming_extras, unknown_name
+from ethbrake_marl.episode.layer import MODEL, STATE
+from ethbrake_marl.errors import InvalidInput, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation import statistics
-from ethbrake_marl.evaluation.captions import caption, ranges_of
 from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, Measure, MeasureValues, Statistic
-from ethbrake_marl.evaluation.summary_row import EXPLOITS, SEES_THROUGH, SummaryRow
+from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, PUSHED_FAR_M, Measure, MeasureValues, Statistic
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, flat_row, terminal_text
+from ethbrake_marl.worlds.quantities import QUANTITIES
 
 BASELINE = "full_brake"
+SEES_THROUGH, EXPLOITS = "†", "‡"  # marks of teams
+OUTSIDE_SHARE = 0.1  # a policy drives elsewhere if a larger share of its decisions is outside its training's range
+MOVING_SHARE = 0.05  # an exploit if a vehicle still moves at the horizon in a larger share of worlds
 IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
 COMPARE = {"difference": statistics.difference, "decrease": statistics.decrease}
 _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
@@ -27,6 +30,15 @@ _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
 WIDE = 30  # characters of a line about a team in a terminal
 FEW = 3  # teams whose intervals fit beside each other in a terminal
 FIRST_COLUMNS = ("collision_rate", *COLUMN.values())  # columns whose intervals stand below the values
+
+SYMBOLS = {
+    "gaps_m": ("d", "m"), "speeds_mps": ("v", "m/s"), "braking_capacity_mps2": ("braking capacity", "m/s²"),
+    "driving_capacity_mps2": ("driving capacity", "m/s²"), "latency_s": ("τ", "s"), "mass_t": ("m", "t"),
+    "restitution": ("e", ""), "obstacle_gap_m": ("obstacle at", "m"), "friction": ("friction", ""),
+    "brake_rate_mps3": ("brake rate", "m/s³"), "release_rate_mps3": ("release rate", "m/s³"),
+    "harm_weight": ("weight of harm", ""),
+}  # fmt: skip
+STAY = "\u00a0"  # a space at which no line ends
 
 HEADINGS = {
     "Agent": "The agent that controls the vehicle. All other vehicles follow the scripts of the scenario. full_brake is"
@@ -38,6 +50,88 @@ HEADINGS = {
     " they read values that the V2X channel hides in these worlds.",
     "Decrease": "1 − (mean harm) / (mean harm of the baseline in the same worlds). Interval: delta method.",
 }
+
+
+@dataclass(frozen=True)
+class SummaryRow:
+    """Results of one team. ``row["total_harm"]`` is the estimate with this key in JSON, or None if it is not defined.
+
+    >>> import ethbrake_marl as eb
+    >>> (row,) = eb.summarise(eb.evaluate("paper-random", "full_brake", episodes=3))
+    >>> row.agent, row.knows, row.collisions, round(row["total_harm"].value, 2)
+    ('full_brake', 'own sensors', 2, 36.99)
+
+    """
+
+    agent: str
+    knows: str  # what the team has to know
+    estimates: Mapping[str, Estimate | None]
+    collisions: int  # number of worlds with an impact
+    horizon_ends: int  # number of worlds in which a vehicle still moves at the horizon
+    episodes: int  # number of worlds
+    hidden_share: float  # share of worlds in which the V2X channel hides something from a controlled vehicle
+    drivers: Mapping[str, str]  # vehicle -> name of its agent
+    policies: Mapping[str, str]  # vehicle -> SHA-256 of its policy
+
+    def __getitem__(self, key: str) -> Estimate | None:
+        if key not in self.estimates:
+            raise unknown_name("estimate", key, self.estimates)
+        return self.estimates[key]
+
+    @property
+    def sees_through(self) -> bool:
+        """Whether the team is omniscient: it reads values that the V2X channel hides in these worlds."""
+        return self.hidden_share > 0.0 and any(word in self.knows for word in (STATE, MODEL))
+
+    @property
+    def outside(self) -> float:
+        """Share of the decisions of the team's policies outside the range of their training; 0 if it is unknown."""
+        share = self.estimates.get("outside")
+        return 0.0 if share is None else share.value
+
+    @property
+    def is_outside(self) -> bool:
+        return self.outside > OUTSIDE_SHARE
+
+    @property
+    def exploits(self) -> dict[str, str]:
+        """Conduct of the team that harm does not count: name -> size in words.
+
+        ``pushes``: the team pushes Vehicle 1 far. ``moving``: a vehicle often still moves at the horizon.
+        """
+        pushed, moving = self.estimates.get("pushed_m_1"), self.horizon_ends / self.episodes
+        words = {}
+        if pushed is not None and pushed.value > PUSHED_FAR_M:
+            words["pushes"] = f"pushes Vehicle 1 by {pushed.value:.1f} m on average"
+        if moving > MOVING_SHARE:
+            words["moving"] = f"runs past the horizon in {100 * moving:.1f} % of worlds"
+        return words
+
+    @property
+    def marked(self) -> str:
+        """Name of the team, with ‡ if the team has ``exploits``."""
+        return f"{self.agent} {EXPLOITS}" if self.exploits else self.agent
+
+    @property
+    def about(self) -> str:
+        """What the team knows, with † if it is omniscient; and who drives which vehicle if its agents differ."""
+        mixed = len({*self.drivers.values()}) > 1
+        drivers = [f"{vehicle}: {agent}" for vehicle, agent in self.drivers.items() if mixed]
+        return "; ".join([f"{SEES_THROUGH} " * self.sees_through + self.knows, *drivers])
+
+    def to_json(self) -> dict[str, Any]:
+        """Row as plain data: each estimate with interval, standard error and degrees of freedom; None if unknown."""
+        plain: dict[str, Any] = {
+            "agent": self.agent, "knows": self.knows, "sees_through_channel": self.sees_through,
+            "hidden_share": self.hidden_share, "episodes": self.episodes, "collisions": self.collisions,
+            "horizon_ends": self.horizon_ends, "exploits": list(self.exploits),
+            "drivers": dict(self.drivers),
+        }  # fmt: skip
+        for key, estimate in self.estimates.items():
+            plain |= Estimate.side_by_side({key: estimate})
+            plain[f"{key}_error"] = None if estimate is None else estimate.error
+            plain[f"{key}_freedom"] = None if estimate is None else estimate.freedom
+        return plain | {"policy_sha256": dict(self.policies)}
 
 
 class SummaryTable(list[SummaryRow]):
@@ -306,3 +400,42 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
     if elsewhere:
         note += f" More than 10 % of its decisions are outside the range of its training: {', '.join(elsewhere)}."
     return Sheet("", columns, rows, note)
+
+
+def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
+    """Quantities of worlds, key -> value, or ``[smallest, largest]`` if the worlds differ.
+
+    A quantity of vehicles or pairs has a list with an entry for each of them: ``{"gaps_m": [7.0, [5.0, 9.0]],
+    "restitution": 0.1}``. ``worlds``: columns, name -> [n]. A column without any number is left out.
+    """
+    ranges: dict[str, Any] = {}
+    for key, rule in QUANTITIES.items():
+        names = [name for i in range(len(worlds)) if (name := rule.column_of(i)) in worlds] if rule.column else []
+        columns = [worlds[name] for name in dict.fromkeys(names) if not np.isnan(worlds[name]).all()]
+        ends = [[float(np.nanmin(column)), float(np.nanmax(column))] for column in columns]
+        plain = [low if low == high else [low, high] for low, high in ends]
+        if plain:
+            ranges[key] = plain[0] if rule.per == "world" else plain
+    return ranges
+
+
+def caption(parameters: Mapping[str, Any]) -> str:
+    """One line with scenario, number of worlds, seed, recordings and quantities, from ``SummaryTable.parameters``."""
+    parts = []
+    for key, (symbol, unit) in SYMBOLS.items():
+        if key in parameters:
+            entries = [parameters[key]] if QUANTITIES[key].per == "world" else parameters[key]
+            texts = [f"{e[0]:.3g}–{e[1]:.3g}" if isinstance(e, list) else f"{e:.4g}" for e in entries]
+            value = texts[0] if len(set(texts)) == 1 else f"({f',{STAY}'.join(texts)})"
+            parts.append(f"{symbol}{STAY}={STAY}{value}{f'{STAY}{unit}' if unit else ''}")
+    seed = "" if parameters.get("seed") is None else f", seed {parameters['seed']}"
+    worlds = f"{count_of(parameters['count'], 'world')}{seed}{by_recording(parameters.get('recordings', 0))}"
+    physics = f" (physics: {parameters['physics']})" if "physics" in parameters else ""
+    return f"{parameters['scenario']}{physics}: {worlds}; {'; '.join(parts)}"
+
+
+def by_recording(recordings: int) -> str:
+    """End of a caption: the number of traffic recordings on which the 95 % intervals rest; empty for 0 recordings."""
+    if recordings == 1:
+        return "; no 95 % intervals: all worlds come from one recording"
+    return f"; 95 % intervals by {recordings:,} recordings" if recordings else ""

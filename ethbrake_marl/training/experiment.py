@@ -12,9 +12,9 @@ from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.compared import Compared
-from ethbrake_marl.evaluation.door import EPISODES, SEED, evaluate
-from ethbrake_marl.evaluation.named_measures import MEASURES
+from ethbrake_marl.evaluation.comparison import Comparison
+from ethbrake_marl.evaluation.evaluate import EPISODES, SEED, evaluate
+from ethbrake_marl.evaluation.measure_registry import MEASURES
 from ethbrake_marl.evaluation.results import RESULTS, write_results
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.recipe import TrainingRecipe
@@ -32,7 +32,7 @@ class Experiment(NamedTuple):
     """A trained policy or team, and its comparison with the baselines."""
 
     trained: TrainResult
-    compared: Compared
+    compared: Comparison
     measures: tuple[str, ...]  # names of the measures beside the usual ones
     started: float  # ``time.monotonic`` at the start (s)
 
@@ -42,11 +42,11 @@ class Experiment(NamedTuple):
 
     def in_another(
         self, scenario: Scenario, episodes: int, baselines: Sequence[str], measures: Sequence[str]
-    ) -> Compared:
+    ) -> Comparison:
         count = self.compared.harm_count
         teams = compared_teams(self.trained, scenario, count, baselines)
         seed = self.compared.result.about["seed"]
-        return Compared.of(scenario, teams, episodes=episodes, seed=seed, harm_count=count, measures=measures)
+        return Comparison.of(scenario, teams, episodes=episodes, seed=seed, harm_count=count, measures=measures)
 
 
 class ReportWriter(Protocol):
@@ -120,7 +120,7 @@ def run_experiment(
                 " again to stop immediately)"
             )
         tell(Progress("evaluation", 0, episodes, note=note))
-        compared = Compared.of(
+        compared = Comparison.of(
             scenario, compared_teams(trained, scenario, count, baselines), episodes=episodes, seed=list_seed,
             harm_count=count, measures=measures, on_done=lambda worlds: tell(Progress("evaluation", worlds, episodes)),
         )  # fmt: skip

@@ -29,7 +29,7 @@ from ethbrake_marl.episode.features import FEATURES, GROUPS, register_feature
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar
-from ethbrake_marl.evaluation.door import evaluate
+from ethbrake_marl.evaluation.evaluate import evaluate
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env

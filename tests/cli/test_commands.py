@@ -86,7 +86,7 @@ def test_defect_of_the_program__keeps_its_traceback_and_missing_memory_is_one_li
     with pytest.raises(RuntimeError, match="a defect"):
         ethbrake("scenario", "list")
     short = Mock(side_effect=MemoryError("Unable to allocate 9 TiB"))
-    monkeypatch.setattr("ethbrake_marl.evaluation.compared.evaluate", short)
+    monkeypatch.setattr("ethbrake_marl.evaluation.comparison.evaluate", short)
     check_refused(ethbrake("evaluate"), "not enough memory (Unable to allocate 9 TiB)", "fewer worlds")
 
 

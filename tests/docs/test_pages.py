@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.evaluation.trial import COMPARED
+from ethbrake_marl.cli.trial import COMPARED
 from tests.docs.blocks import Reader, blocks
 from tests.docs.printed import PAGES, ROOT
 

@@ -12,8 +12,8 @@ from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.layer import SENSORS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.evaluate import Result, evaluate_teams
-from ethbrake_marl.evaluation.identity import about_scenario
-from ethbrake_marl.evaluation.named_measures import measures_called
+from ethbrake_marl.evaluation.measure_registry import measures_called
+from ethbrake_marl.evaluation.provenance import about_scenario
 from ethbrake_marl.worlds.scenario import Scenario
 
 # Two vehicles at 20 m/s, 1 m apart, brake with 6 m/s2, the rear one from 0.5 s. By hand: at 0.5 s the gap is 0.25 m and

@@ -25,8 +25,8 @@ from ethbrake_marl.episode.terms import TERMS, register_term
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, UnknownName
 from ethbrake_marl.evaluation import evaluate as evaluating
 from ethbrake_marl.evaluation.evaluate import evaluate_teams
+from ethbrake_marl.evaluation.measure_registry import MEASURES, measures_called, register_measure
 from ethbrake_marl.evaluation.measures import Measure, Statistic
-from ethbrake_marl.evaluation.named_measures import MEASURES, measures_called, register_measure
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.motion.layout import GAP

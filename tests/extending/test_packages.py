@@ -16,7 +16,7 @@ from ethbrake_marl.episode.features import FEATURES
 from ethbrake_marl.episode.objectives import OBJECTIVES
 from ethbrake_marl.episode.terms import TERMS
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
-from ethbrake_marl.evaluation.named_measures import MEASURES
+from ethbrake_marl.evaluation.measure_registry import MEASURES
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.training.recipe import ALGORITHMS
 

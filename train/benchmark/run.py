@@ -35,7 +35,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.cli.settings import read_settings
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.benchmark import BENCHMARK, EPISODES, benchmark_rows, evaluate_task
-from ethbrake_marl.evaluation.door import SEED
+from ethbrake_marl.evaluation.evaluate import SEED
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.sheet import csv_text

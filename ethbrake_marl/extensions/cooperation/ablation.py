@@ -26,10 +26,9 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, amounts, objectives_of
 from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.door import SEED
-from ethbrake_marl.evaluation.evaluate import evaluate_teams
-from ethbrake_marl.evaluation.identity import about_scenario
+from ethbrake_marl.evaluation.evaluate import SEED, evaluate_teams
 from ethbrake_marl.evaluation.measures import Measure, MeasureValue
+from ethbrake_marl.evaluation.provenance import about_scenario
 from ethbrake_marl.evaluation.statistics import Clusters
 from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds
 from ethbrake_marl.extensions.search.best_harm import search_list

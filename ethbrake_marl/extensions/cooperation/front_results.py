@@ -14,9 +14,9 @@ from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.captions import by_recording
-from ethbrake_marl.evaluation.identity import about_scenario, versions, worlds_sha256
+from ethbrake_marl.evaluation.provenance import about_scenario, versions, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Clusters, difference, mean
+from ethbrake_marl.evaluation.summary import by_recording
 from ethbrake_marl.extensions.cooperation.front import BorneHarm, Front, weighted_harm
 from ethbrake_marl.extensions.cooperation.results import Json
 from ethbrake_marl.extensions.report.style import (

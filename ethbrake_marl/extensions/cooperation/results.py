@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from ethbrake_marl.episode.counts import COLUMN, IN_WORDS
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.door import SEED
+from ethbrake_marl.evaluation.evaluate import SEED
 from ethbrake_marl.extensions.cooperation.ablation import CSV, FIGURE, FULL, JSON, Ablation, LevelResult
 from ethbrake_marl.extensions.cooperation.seeds import mean_over_seeds, share_over_seeds
 from ethbrake_marl.extensions.report.style import (

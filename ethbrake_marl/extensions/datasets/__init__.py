@@ -22,8 +22,8 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput, check_whole_number, naming_extras
-from ethbrake_marl.evaluation.door import SEED
-from ethbrake_marl.evaluation.identity import versions
+from ethbrake_marl.evaluation.evaluate import SEED
+from ethbrake_marl.evaluation.provenance import versions
 from ethbrake_marl.files.store import check_target, new_file
 from ethbrake_marl.worlds.open_game import AnyScenario
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ethbrake_marl.episode.objectives import Harm
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.evaluation.resimulation import simulate_again
+from ethbrake_marl.evaluation.record import simulate_again
 from ethbrake_marl.motion.elementary import exp_each, log_each, logistic
 from ethbrake_marl.motion.layout import FRONT_CHANGE, IMPACTS, MASS, REAR_CHANGE, RESTITUTION, Floats
 from ethbrake_marl.registry import Part

@@ -10,7 +10,7 @@ import numpy as np
 from ethbrake_marl.episode.commands import action_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
-from ethbrake_marl.evaluation.resimulation import advance_worlds
+from ethbrake_marl.evaluation.record import advance_worlds
 from ethbrake_marl.motion.layout import (
     FAR_M,
     FIRST,

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.counts import COLUMN, HARM
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.motion.layout import Bools, Floats
 
@@ -51,7 +51,7 @@ class BestKnown(NamedTuple):
         return np.asarray(result[agent][COLUMN[count]] - self.harm[count])
 
 
-def shown_counts(compared: Compared) -> dict[str, str]:
+def shown_counts(compared: Comparison) -> dict[str, str]:
     """Counts to show, count -> column: first-impact harm, total harm, and the count that agents minimise.
 
     The count that agents minimise is left out if the best known harm has been measured for other counts only.

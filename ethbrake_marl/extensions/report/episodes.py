@@ -13,7 +13,7 @@ from markupsafe import Markup
 from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.counts import COLUMN, HARM
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episodes
 from ethbrake_marl.evaluation.summary import BASELINE
 from ethbrake_marl.extensions.rendering.scene import BODY_M
@@ -29,7 +29,7 @@ MOST_SHOWN = 3  # agents that are shown at the start
 
 
 def player(
-    compared: Compared, focus: str, kinds: Mapping[int, str], records: Mapping[str, Sequence[EpisodeRecord]]
+    compared: Comparison, focus: str, kinds: Mapping[int, str], records: Mapping[str, Sequence[EpisodeRecord]]
 ) -> Markup:
     """Player of the episodes of all agents in some worlds, as HTML.
 
@@ -140,7 +140,7 @@ WORLDS_PER_KIND = 5  # worlds of every kind except the worst and the random ones
 TYPICAL = (0.5, 0.6, 0.7, 0.8, 0.9)  # quantiles of the harm
 
 
-def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
+def shown_worlds(compared: Comparison, focus: str) -> dict[int, str]:
     """Worlds in which to show the agent ``focus``, at most ``MOST_WORLDS``: row of the result -> why it is shown."""
     result, column = compared.result, COLUMN[compared.harm_count]
     cost, best_known, chosen = result[focus][column], BestKnown.of(result), dict[int, str]()
@@ -163,7 +163,7 @@ def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
     return chosen
 
 
-def worst_rows(compared: Compared, focus: str) -> Ints:
+def worst_rows(compared: Comparison, focus: str) -> Ints:
     """Rows of the worlds in which ``focus`` did worst, worst first, at most ten.
 
     A world is worse if the count that agents minimise, minus its best known value if there is one, is larger. Worlds in
@@ -180,7 +180,7 @@ def rows_by_value(value: Floats, among: Bools) -> Ints:
     return order[among[order]]
 
 
-def episodes_section(compared: Compared, focus: str, kinds: dict[int, str]) -> Section:
+def episodes_section(compared: Comparison, focus: str, kinds: dict[int, str]) -> Section:
     """Section that plays back the worlds ``kinds`` (row -> why it is shown).
 
     Every team drives these worlds again. A note names every agent whose harm now differs from its harm in the

@@ -18,11 +18,11 @@ from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.evaluation.captions import caption, ranges_of
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.record import EpisodeRecord
 from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.evaluation.summary import caption, ranges_of
 from ethbrake_marl.extensions.rendering.picture import PALETTE, Frame, picture, vehicle_colour
 from ethbrake_marl.extensions.rendering.scene import AHEAD_M, Scene
 from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
@@ -110,7 +110,7 @@ BINS = 12  # groups of worlds with similar gaps
 
 
 @in_our_style
-def harm_by_agent(compared: Compared, tests: Mapping[str, Compared]) -> Figure:
+def harm_by_agent(compared: Comparison, tests: Mapping[str, Comparison]) -> Figure:
     """Draw the mean harm of each agent as a bar with its 95 % interval.
 
     A vertical line shows the mean best known harm. Marks show the agents' means in other ``tests``, title -> results.
@@ -140,7 +140,7 @@ def harm_by_agent(compared: Compared, tests: Mapping[str, Compared]) -> Figure:
 
 
 @in_our_style
-def harm_above(compared: Compared) -> Figure:
+def harm_above(compared: Comparison) -> Figure:
     """Draw, for every x, the share of worlds in which an agent's regret (harm minus best known harm) is above x.
 
     If no best known harm has been measured, harm takes the place of regret.

@@ -13,11 +13,9 @@ from markupsafe import Markup
 from ethbrake_marl.agent_names import AGENTS, WRAPPERS
 from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.captions import caption
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.evaluation.summary import BASELINE, IDENTITY, SummaryTable
-from ethbrake_marl.evaluation.summary_row import SummaryRow
+from ethbrake_marl.evaluation.summary import BASELINE, IDENTITY, SummaryRow, SummaryTable, caption
 from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.figures import harm_above, harm_by_agent
@@ -35,7 +33,7 @@ COUNTED_WORDS = {  # count -> verb, noun, and what is counted
 }
 
 
-def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]) -> str:
+def first_sentence(compared: Comparison, focus: str, tests: Mapping[str, Comparison]) -> str:
     """First sentence of the page: the harm of the agent ``focus`` compared with full braking.
 
     It also names the tests in which the agent does not do less harm than full braking. ``tests``: title of another test
@@ -108,7 +106,7 @@ GLOSSARY = {
 
 class Test(NamedTuple):
     about: str  # how it differs
-    compared: Compared
+    compared: Comparison
 
 
 @dataclass(frozen=True)
@@ -116,7 +114,7 @@ class ReportPage:
     """Content of a report. When the page is made, its agents drive the worlds that it shows once more."""
 
     title: str
-    compared: Compared
+    compared: Comparison
     summary: str  # one or two sentences about the agents
     settings: Mapping[str, object]  # by name
     focus: str = ""  # agent that the page is mainly about; "": the last one with a policy, or the last one
@@ -195,7 +193,7 @@ def measure_parts(agents: SummaryTable) -> list[Markup]:
     return [line, page_part("folded", "Every measure", tables)]
 
 
-def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> Section:
+def worst_section(compared: Comparison, focus: str, watched: Collection[int]) -> Section:
     """Section with a table of the worlds in which ``focus`` did worst, at most ten.
 
     ``watched``: rows of the worlds that the page can play back; these rows get a button that starts the player.
@@ -222,7 +220,7 @@ def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> S
     )
 
 
-def avoidable_section(compared: Compared) -> Section:
+def avoidable_section(compared: Comparison) -> Section:
     """Section on regret (harm minus best known harm): a figure, and tables.
 
     The tables divide the worlds by whether an impact is proven unavoidable. If no best known harm has been measured:
@@ -246,7 +244,7 @@ def avoidable_section(compared: Compared) -> Section:
     return Section("What was avoidable", [*body, drawing(figure, "Regret", words)])
 
 
-def _harm_among(compared: Compared, best_known: BestKnown, where: str, among: Bools) -> Sheet:
+def _harm_among(compared: Comparison, best_known: BestKnown, where: str, among: Bools) -> Sheet:
     """Table of each agent's collision rate, harm and regret in the worlds of the mask ``among`` [n].
 
     ``where``: description of these worlds, for the title.
@@ -279,7 +277,7 @@ def _test_body(test: Test) -> list[str]:
     return [test.about, short_table(rows, test.compared.harm_count), *notes, *measure_parts(rows)]
 
 
-def write_evaluation(path: Path, compared: Compared, command: str, *, force: bool = False) -> None:
+def write_evaluation(path: Path, compared: Comparison, command: str, *, force: bool = False) -> None:
     scenario, agents = compared.scenario, [row.agent for row in compared.table]
     names = ", ".join(agents)
     scripts = ", ".join(f"{vehicle} by {role}" for vehicle, role in scenario.roles.items() if role != "learner")

@@ -14,12 +14,11 @@ from markupsafe import Markup
 from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
 from ethbrake_marl.errors import Unfamiliar
-from ethbrake_marl.evaluation.captions import caption
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.results import write_results
 from ethbrake_marl.evaluation.statistics import difference, mean
-from ethbrake_marl.evaluation.summary import BASELINE
+from ethbrake_marl.evaluation.summary import BASELINE, caption
 from ethbrake_marl.extensions.report.best_known import REPORT_MEASURES
 from ethbrake_marl.extensions.report.figures import curves_figure, harm_against_total_gap, trajectories
 from ethbrake_marl.extensions.report.page import Section, drawing, table
@@ -57,7 +56,7 @@ class RunReport:
         def begin(stage: str) -> None:
             tell(Progress(f"report{stage and ': '}{stage}", next(stage_numbers), 2 + len(tests)))
 
-        test_results: dict[str, Compared] = {}
+        test_results: dict[str, Comparison] = {}
         for test in tests:
             begin(f"the same policy in {test.name}")
             with warnings.catch_warnings():  # the page says on what the policy was trained
@@ -131,7 +130,7 @@ def write_figures(experiment: Experiment) -> list[Markup]:
     return [drawing(figure, title, description) for title, description, figure in figures.values()]
 
 
-def typical_row_of(compared: Compared, learned: str) -> int:
+def typical_row_of(compared: Comparison, learned: str) -> int:
     """Row of a typical world: of the worlds in which full braking does harm, the one with the median saving of harm.
 
     The saving is that of the agent ``learned``. Row 0 if full braking does no harm.
@@ -146,7 +145,7 @@ def typical_row_of(compared: Compared, learned: str) -> int:
 
 
 def report_page(
-    experiment: Experiment, test_results: Mapping[str, Compared], figures: Sequence[Markup], learners: Sequence[Sheet]
+    experiment: Experiment, test_results: Mapping[str, Comparison], figures: Sequence[Markup], learners: Sequence[Sheet]
 ) -> ReportPage:
     """Page about a training run: settings, the compared agents, the paper's rows (in its own test), and other tests.
 
@@ -199,15 +198,15 @@ def report_page(
     )
 
 
-def learners_sheets(compared: Compared) -> list[Sheet]:
+def learners_sheets(compared: Comparison) -> list[Sheet]:
     return [*(_borne_sheet(compared, count) for count in _counts(compared)), _added_sheet(compared)]
 
 
-def _counts(compared: Compared) -> list[str]:
+def _counts(compared: Comparison) -> list[str]:
     return [*dict.fromkeys([*HARM, compared.harm_count])]
 
 
-def _borne_sheet(compared: Compared, count: str) -> Sheet:
+def _borne_sheet(compared: Comparison, count: str) -> Sheet:
     """Table of the mean harm that each vehicle and the whole line bear under each agent. ``count``: count of harm."""
     scenario, by = compared.scenario, compared.result.clusters
     names = [name.replace("_", " ").capitalize() for name in scenario.vehicle_names]
@@ -222,7 +221,7 @@ def _borne_sheet(compared: Compared, count: str) -> Sheet:
     return Sheet(f"Who bears what: {IN_WORDS[count]}, mean per world (m²/s²)", columns, rows, f"{learn} learn.")
 
 
-def _added_sheet(compared: Compared) -> Sheet:
+def _added_sheet(compared: Comparison) -> Sheet:
     """Table of the harm that is added if a learner of the trained team brakes fully instead, for each learner."""
     result, counts, rows = compared.result, _counts(compared), list[Row]()
     for name in (compared.scenario.vehicle_names[body - 1] for body in compared.scenario.learners):

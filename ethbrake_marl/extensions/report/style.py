@@ -18,7 +18,7 @@ from matplotlib.font_manager import findfont, get_font
 from ethbrake_marl.episode.counts import IN_WORDS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, plain_text
-from ethbrake_marl.evaluation.captions import caption, ranges_of
+from ethbrake_marl.evaluation.summary import caption, ranges_of
 from ethbrake_marl.extensions.rendering.picture import PALETTE
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Floats

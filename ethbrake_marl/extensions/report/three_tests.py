@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.captions import caption
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
+from ethbrake_marl.evaluation.summary import caption
 from ethbrake_marl.extensions.report.best_known import BestKnown
 from ethbrake_marl.files.sheet import Estimate, Sheet
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -42,7 +42,7 @@ def title_of(name: str) -> str:
     return TESTS[name].partition(":")[0]
 
 
-def short_sheet(compared: Compared, test_results: Mapping[str, Compared]) -> Sheet:
+def short_sheet(compared: Comparison, test_results: Mapping[str, Comparison]) -> Sheet:
     """Short table of agents: collision rate, first-impact and total harm.
 
     If agents minimise the honest cost, also this cost and the push. ``test_results``: name of another test -> its

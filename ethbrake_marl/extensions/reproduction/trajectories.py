@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ethbrake_marl.agent_names import open_game, teams_of
-from ethbrake_marl.evaluation.door import SEED
+from ethbrake_marl.evaluation.evaluate import SEED
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style
 from ethbrake_marl.extensions.reproduction.learning import RANDOM, courses_of, process

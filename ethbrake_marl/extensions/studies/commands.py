@@ -58,7 +58,7 @@ def falsify_command(
         import numpy as np
 
         from ethbrake_marl.cli.settings import read_settings
-        from ethbrake_marl.evaluation.identity import about_scenario, versions
+        from ethbrake_marl.evaluation.provenance import about_scenario, versions
         from ethbrake_marl.extensions.studies.machine import this_machine
         from ethbrake_marl.extensions.studies.weakness import WeaknessMeasure, states_of
 

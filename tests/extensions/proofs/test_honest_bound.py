@@ -10,7 +10,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.step import hold_commands
-from ethbrake_marl.evaluation.resimulation import advance_worlds
+from ethbrake_marl.evaluation.record import advance_worlds
 from ethbrake_marl.extensions.proofs import line as row
 from ethbrake_marl.extensions.proofs.avoidability import FRONT, REASON, VERDICT, decide
 from ethbrake_marl.extensions.proofs.chain_search import chain_bound, triple_contact

@@ -8,7 +8,7 @@ import numpy as np
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import at_alert
-from ethbrake_marl.evaluation.resimulation import advance_worlds
+from ethbrake_marl.evaluation.record import advance_worlds
 from ethbrake_marl.motion.layout import FAR_M, LIMIT, Floats, scratch_for
 from tests.motion.lines import lines
 

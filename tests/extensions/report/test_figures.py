@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import teams_of
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import (
     BINS,
@@ -91,7 +91,7 @@ def test_worlds_figure__shows_every_quantity_that_varies_and_three_worlds() -> N
 # ---- of an evaluation
 
 
-def test_harm_by_agent__bars_line_and_marks_are_the_means(searched: Compared) -> None:
+def test_harm_by_agent__bars_line_and_marks_are_the_means(searched: Comparison) -> None:
     other = compared_by("paper-random-obstacle", "coast,ppo,full_brake", 20)
     figure = harm_by_agent(searched, {"Other test": other})
     (axes,) = figure.axes
@@ -106,7 +106,7 @@ def test_harm_by_agent__bars_line_and_marks_are_the_means(searched: Compared) ->
     assert legend(figure) == ["best known", "other test"]
 
 
-def test_harm_above__shares_are_those_of_the_worlds(compared: Compared, searched: Compared) -> None:
+def test_harm_above__shares_are_those_of_the_worlds(compared: Comparison, searched: Comparison) -> None:
     for one, label in ((compared, "Harm"), (searched, "Regret")):
         axes = harm_above(one).axes[0]
         drawn, values = axes.lines[0], one.result["full_brake"]["first_impact_harm"]
@@ -116,7 +116,7 @@ def test_harm_above__shares_are_those_of_the_worlds(compared: Compared, searched
         assert axes.get_xlabel().startswith(label)
 
 
-def test_harm_against_total_gap__means_and_bands_are_those_of_the_groups(compared: Compared) -> None:
+def test_harm_against_total_gap__means_and_bands_are_those_of_the_groups(compared: Comparison) -> None:
     figure = harm_against_total_gap(compared.result)
     first, total = figure.axes
     gap = compared.result.worlds["gap_1_m"] + compared.result.worlds["gap_2_m"]

@@ -10,7 +10,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import _EXTRA_OF
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, is_papers_test, printed_sheet
 from ethbrake_marl.extensions.report.run import learners_sheets, typical_row_of
 from ethbrake_marl.extensions.report.three_tests import TESTS, is_as_shipped, other_tests, short_sheet
@@ -118,7 +118,7 @@ def test_several_learners__who_bears_what_and_what_each_adds(tmp_path: Path) -> 
 )
 def test_typical_row__is_the_median_saving_among_harmful_worlds(before: Any, after: Any, row: int) -> None:
     result = {"full_brake": {"total_harm": np.array(before)}, "mine": {"total_harm": np.array(after)}}
-    assert typical_row_of(Compared(None, {}, result, None, "total"), "mine") == row  # type: ignore[arg-type]
+    assert typical_row_of(Comparison(None, {}, result, None, "total"), "mine") == row  # type: ignore[arg-type]
 
 
 def test_three_tests__are_each_others_and_of_the_shipped_scenarios_only() -> None:

@@ -7,15 +7,14 @@ from typing import Any, NamedTuple
 
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.evaluation.door import evaluate
-from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.evaluation.named_measures import split_names
+from ethbrake_marl.evaluation.evaluate import Result, evaluate
+from ethbrake_marl.evaluation.measure_registry import split_names
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.motion.layout import Ints
 from ethbrake_marl.worlds.scenario import Scenario
 
 
-class Compared(NamedTuple):
+class Comparison(NamedTuple):
     scenario: Scenario
     teams: Mapping[str, Team]
     result: Result
@@ -31,7 +30,7 @@ class Compared(NamedTuple):
         harm_count: str = "first",
         measures: Iterable[str] | str = (),
         **more: Any,
-    ) -> Compared:
+    ) -> Comparison:
         """Evaluate the teams by ``evaluate(..., **more)``, and summarise the result.
 
         For the count ``honest`` the measure ``pushed_mps`` is added.
