@@ -29,7 +29,7 @@ PER_PROCESS = 16  # calls in one batch for a backend that returns the results of
 
 Call = tuple[Callable[..., Any], *tuple[Any, ...]]  # a module-level function and its arguments
 
-PREPARATIONS: list[Call] = []  # calls that a worker process makes before those that it is sent
+PREPARATIONS: dict[str, Call] = {}  # name -> call that a worker process makes before those that it is sent
 _SHARES: dict[int, int] = {}  # process -> cores that it may use, if it is a worker
 
 
@@ -92,7 +92,7 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
         share = cores // jobs
     with parallel_config(**one_thread):
         parallel = Parallel(jobs, batch_size=1, return_as="generator" if streams else "list")
-    first = [_pickle_call(call) for call in PREPARATIONS]
+    first = [_pickle_call(call) for call in PREPARATIONS.values()]
     work = (delayed(_answer)(os.getpid(), share, first, _pickle_call(call)) for call in calls)
     batches = [work] if streams else iter(lambda: list(islice(work, PER_PROCESS * jobs)), [])
     for batch in batches:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.pairwise import ConstantDeceleration, closed_form, pairwise
-from ethbrake_marl.agents.team import NO_BODIES
+from ethbrake_marl.agents.team import NO_BODIES, PREDICTED
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.layer import MODEL, STATE
 from ethbrake_marl.episode.state import State
@@ -149,7 +149,14 @@ class BaselineMemory(NamedTuple):
     predicted_harm: Floats  # [n] m2/s2
 
 
-class EV2XBM:
+class Predicting:
+    """Base class of agents whose memory has ``predicted_harm``, which evaluations report where it is finite."""
+
+    def measures(self, last: State, memory: Any, body: int) -> dict[str, Floats]:
+        return {PREDICTED: memory.predicted_harm} if np.isfinite(memory.predicted_harm).all() else {}
+
+
+class EV2XBM(Predicting):
     """Brakes with the deceleration of ``coupled``, assuming that the other learners brake fully.
 
     If they do, the predicted harm is, to the last bit, the harm of the episode.
@@ -190,7 +197,7 @@ class EV2XBM:
         return memory.command, memory
 
 
-class EV2XBMPairwise:
+class EV2XBMPairwise(Predicting):
     """Brakes with the deceleration of ``pairwise``, the paper's closed form."""
 
     name, knows = "e_v2x_bm:pairwise", STATE

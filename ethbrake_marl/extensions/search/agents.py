@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agent_names import AgentSettings, make_agent
+from ethbrake_marl.agents.e_v2x_bm import Predicting
 from ethbrake_marl.agents.team import Agent, Team
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MODEL
@@ -37,7 +38,7 @@ class SearchMemory(NamedTuple):
     predicted_harm: Floats  # [n] m2/s2
 
 
-class Planner:
+class Planner(Predicting):
     """Agent that chooses all its commands at the alert. It assumes that other learners brake fully.
 
     If the other learners do so, the harm that happens is the memory's ``predicted_harm``, to the last bit.

@@ -23,15 +23,15 @@ class Seeing:
 
     name = "seeing"
 
-    def __init__(self, knows: str) -> None:
-        self.knows, self.states = knows, list[State]()
+    def __init__(self, knows: str, share: float = 0.3) -> None:
+        self.knows, self.share, self.states = knows, share, list[State]()
 
     def begin(self, alert: State, body: int) -> None:
         """Remember nothing."""
 
     def act(self, state: State, memory: None, body: int) -> Any:
         self.states.append(state)
-        return -0.3 * state.car[:, 3, body], memory
+        return -self.share * state.car[:, 3, body], memory
 
 
 def driven(scenario: eb.Scenario, agent: Any, n: int = 6) -> list[State]:
@@ -108,9 +108,9 @@ def test_a_script_of_a_role__sees_the_true_state_only_if_it_claims_more(knows: s
 
 
 def speeds_seen(knows: str) -> list[float]:
-    """Speeds that an agent of Vehicle 2 sees at its first decision in a world of ``messages-noisy``."""
+    """Speeds that an agent of Vehicle 2 sees at its second decision in ``messages-noisy``, after full braking."""
     scenario, game = eb.open_game("messages-noisy")
-    agent = Seeing(knows)
+    agent = Seeing(knows, share=1.0)
     list(eb.play(game, scenario.sample(1, 7), eb.Team("one", {2: agent})))
     return agent.states[1].speeds_mps[0].round(3).tolist()
 
