@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from ethbrake_marl.lazy_imports import names_behind
 from ethbrake_marl.faces.registration import register_environments
 from ethbrake_marl.errors import naming_extras
-from ethbrake_marl.renamed import new_name
 
 if TYPE_CHECKING:
     # Environments
@@ -120,7 +119,7 @@ def _import_public(name: str) -> Any:
         if find_spec(folder) is not None and find_spec(f"{folder}.{name}") is not None:
             return import_module(f"{folder}.{name}")
         close = get_close_matches(name, _HOMES, n=1)
-        hint = new_name("attribute", name) or (f"did you mean {close[0]!r}?" if close else "")
+        hint = f"did you mean {close[0]!r}?" if close else ""
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint and '; '}{hint}")
     register_environments()
     with naming_extras():

@@ -14,8 +14,6 @@ from numbers import Integral
 from pkgutil import resolve_name
 from sysconfig import get_paths
 
-from ethbrake_marl.renamed import new_name
-
 _NAMED = 5  # largest number of failed worlds that a message lists one by one
 
 LINE_LIMIT = 1_500  # characters of a message; a longer message is shortened in the middle
@@ -115,7 +113,7 @@ class CorruptBundle(EthBrakeError, ValueError):
     """A policy bundle (the folder of a trained policy) is damaged, or a folder is no bundle. Nothing was loaded."""
 
 
-_EXTRA_OF = {
+EXTRA_OF = {
     **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
     **dict.fromkeys(("matplotlib", "jinja2", "markupsafe"), "report"),
     **dict.fromkeys(("benchmarl", "torchrl", "tensordict", "hydra"), "marl"),
@@ -124,7 +122,6 @@ _EXTRA_OF = {
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("ray", "joblib"), "cluster"),
     "optuna": "tune",
-    "numba_cuda": "cuda",
 }
 
 
@@ -145,7 +142,7 @@ def naming_extras() -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        if package not in _EXTRA_OF:
+        if package not in EXTRA_OF:
             raise
         raise _missing(package) from None
 
@@ -157,7 +154,7 @@ def need(package: str) -> None:
 
 
 def _missing(package: str) -> MissingExtra:
-    line = f"{sys.executable} -m pip install 'ethbrake-marl[{_EXTRA_OF[package]}]'"
+    line = f"{sys.executable} -m pip install 'ethbrake-marl[{EXTRA_OF[package]}]'"
     return MissingExtra(f"needs the package {package}, which is not installed; install it with: {line}")
 
 
@@ -225,8 +222,8 @@ class FreeImpacts(UserWarning):
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Error for an unknown name. Its message says the new name in 2.0, or what else has this name, or suggests similar
-    names, or lists ``known``.
+    """Error for an unknown name. Its message says what else has this name, or suggests similar names, or lists
+    ``known``.
 
     ``kind``: noun such as ``scenario``. ``may_be_own``: a message that lists names also says that a user's own part
     must be registered first.
@@ -247,7 +244,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     others = [other for other, table in tables.items() if first in (table() if callable(table) else table)]
     if others:
         hint = f"{first!r} names another kind: {', '.join(others)}; were two values swapped?"
-    return UnknownName(f"unknown {kind} {name!r}; {new_name(kind, name) or hint}")
+    return UnknownName(f"unknown {kind} {name!r}; {hint}")
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:

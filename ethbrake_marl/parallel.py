@@ -14,10 +14,9 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import redirect_stdout
 from functools import cache
 from itertools import islice
-from multiprocessing import resource_tracker
 from typing import Any
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, check_whole_number, naming_extras
@@ -98,8 +97,7 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
     for batch in batches:
         results: Any = ()
         try:
-            with _blocked_interrupt() if streams else nullcontext():
-                results = parallel(batch)  # a Ctrl-C that was blocked arrives at the end of this clause
+            results = parallel(batch)
             for result in results:  # noqa: UP028  # `yield from` would close `results` outside the clause below
                 yield result
         except BrokenProcessPool:
@@ -107,41 +105,8 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
                 "a worker process was killed, perhaps because memory ran out; use fewer processes at once (--jobs)"
             ) from None
         finally:
-            with warnings.catch_warnings(action="ignore"), _silent_joblib():  # warnings about calls that are cancelled
+            with warnings.catch_warnings(action="ignore"):  # warnings about calls that are cancelled
                 getattr(results, "close", list)()
-
-
-@contextmanager
-def _blocked_interrupt() -> Iterator[None]:
-    """Context in which Ctrl-C is blocked, where the operating system allows it.
-
-    Processes that start in the context inherit the block; they end it when they have begun to ignore Ctrl-C.
-    """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    resource_tracker.ensure_running()  # it starts with the signal unblocked, and would unblock it here, too
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def _silent_joblib() -> Iterator[None]:
-    """Context in which an exception in joblib's thread prints nothing: it may fill a queue that is closed."""
-    before = threading.excepthook
-
-    def tell(arguments: threading.ExceptHookArgs) -> None:
-        if arguments.thread is None or arguments.thread.name != "ExecutorManagerThread":
-            before(arguments)
-
-    threading.excepthook = tell
-    try:
-        yield
-    finally:
-        threading.excepthook = before
 
 
 def _pickle_call(call: Call) -> bytes:

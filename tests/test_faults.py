@@ -59,7 +59,6 @@ HOME = {
     "recipe": lambda: eb.load_recipe("~/x.yaml"),
     "policy": lambda: eb.load_policy("~/x"),
     "agent": lambda: eb.make_agent("policy@~/x"),
-    "model": lambda: eb.policy_agent("~/x.onnx"),
     "worlds": lambda: eb.read_worlds("paper-random", "~/x.csv"),
     "result": lambda: eb.read_result("~/x.json"),
     "run": lambda: eb.resume("~/x"),

@@ -17,13 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.episode.departures import MAP, OBSTACLE
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.contact import contact
 from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.impact import TOUCH_MPS
-from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, GAP, LATENCY, RELEASE_RATE, SPEED, Floats
+from ethbrake_marl.motion.layout import BRAKING, GAP, LATENCY, SPEED, Floats
 
 CLOSED_FORM_CANDIDATES = 9
 RELATIVE_TIE = 1e-12  # harms closer than this, relative to 1 + harm, count as equal
@@ -172,13 +172,7 @@ def pairwise(alert: State, body: int) -> ConstantDeceleration:
     Of equally good decelerations, such as all that avoid both impacts, the middle one is the result. The result depends
     on gaps, speeds, capacities and latencies of the vehicle and its neighbours, and ignores an obstacle.
 
-    Raises ``InvalidInput`` where the proof does not hold: a vehicle moves backward, or brakes build up gradually.
+    Raises ``InvalidInput`` for worlds that depart from the plain game other than by an obstacle or the paper's map.
     """
-    backward = (alert.speeds_mps < 0.0).any(axis=1)
-    builds = np.isfinite(alert.car[:, [BRAKE_RATE, RELEASE_RATE], 1:]).any(axis=(1, 2))
-    for wrong, what in ((backward, "a vehicle moves backward"), (builds, "brakes build up gradually")):
-        if np.any(wrong):
-            raise InvalidInput(
-                f"e_v2x_bm:pairwise: {what} in row {np.argmax(wrong)}, where the closed form does not hold"
-            )
-    return closed_form(alert, np.ascontiguousarray(capacities(alert.car, BRAKING, alert.time_s)), body)
+    require(alert, "e_v2x_bm:pairwise", {OBSTACLE, MAP})
+    return closed_form(alert, np.ascontiguousarray(capacities(alert.car, BRAKING)), body)

@@ -134,7 +134,7 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
     """
     if not isinstance(team, Team):
         raise InvalidInput(f"team = {team!r:.60}: must be a Team, for instance Team.of({{'vehicle_2': agent}}, 'mine')")
-    game = team.game(game)
+    game, alert = team.game(game), game.marked(alert)
     if game.shield is None:
         state, drivers, actions = game.reset(alert), guard_scripts(team.drivers), np.zeros((alert.n, 0))
         memories = {body: begin_script(agent, alert, body) for body, agent in game.agents(drivers).items()}

@@ -8,7 +8,9 @@ import os
 import re
 import signal
 import sys
+import threading
 import warnings
+from _thread import interrupt_main
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from functools import cache
@@ -25,7 +27,6 @@ from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
 from ethbrake_marl.cli.command import INTERRUPTED, Out, example
 from ethbrake_marl.errors import EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.registry import DISTRIBUTION, Registry, giver, points
-from ethbrake_marl.renamed import new_name
 
 app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -34,6 +35,7 @@ app = typer.Typer(
     help="Ethical emergency braking: train, shield and evaluate agents. Every command has a --help with an example.",
     epilog=example("run", "evaluate --agents full_brake,e_v2x_bm --episodes 1000"),
 )
+_IGNORED = threading.Event()  # a Ctrl-C has been ignored and is repeated
 _COMPLETE = "_ETHBRAKE_COMPLETE"  # variable with which a shell asks to complete a command line
 _NAMES = "Names that can be used in --set, recipes and scenarios: ethbrake scenario parts"
 for name, command, usage in (
@@ -66,10 +68,20 @@ def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy starts threads of its own: one core unless asked
     gc.set_threshold(20_000)  # Python's default of 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
     prepare_streams()
+    sys.unraisablehook = repeat_interrupt
     status = run_command(sys.argv[1:])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command has ended
     exec("")  # noqa: S102  # after Ctrl-C inside another `exec`, Python would end without this status
     sys.exit(status)
+
+
+def repeat_interrupt(ignored: sys.UnraisableHookArgs) -> None:
+    """Repeat a Ctrl-C that Python has ignored, because it arrived in a function that LLVM called."""
+    if ignored.exc_type is KeyboardInterrupt:
+        _IGNORED.set()
+        threading.Timer(0.05, interrupt_main).start()  # not now: this function would lose it, too
+    else:
+        sys.__unraisablehook__(ignored)
 
 
 def run_command(arguments: Sequence[str]) -> int:
@@ -90,9 +102,6 @@ def run_command(arguments: Sequence[str]) -> int:
         where = context.command_path if context else "ethbrake"
         message = re.sub(r"Value error, |, unable to parse string as an? \w+", "", error.format_message())
         message = message.replace("Input should be", "must be").replace("a valid integer", "a whole number")
-        unknown = re.match(r"No such command '([\w-]+)'", message)
-        if unknown and (renamed := new_name("command", unknown[1])):
-            message = f"{unknown[0]}; {renamed}"
         return _refuse(f"{message} (see: {where} --help)")
     except EthBrakeError as error:
         return _refuse(str(error))
@@ -104,10 +113,11 @@ def run_command(arguments: Sequence[str]) -> int:
     except MemoryError as error:
         return _refuse(f"not enough memory{f' ({error})' if str(error) else ''}; use fewer worlds at once")
     except KeyboardInterrupt:
-        Out().note("interrupted; repeat the command")
-        return INTERRUPTED
+        return _interrupted()
     except Exception:
-        raise
+        if not _IGNORED.is_set():
+            raise
+        return _interrupted()  # LLVM's callers miss what the interrupted function would have done
     except BaseException as error:  # GeneratorExit and similar, which this package never raises
         return _refuse(f"your own code ended the process: {describe_error(error)}")
     return status
@@ -129,6 +139,11 @@ def _status_of(arguments: Sequence[str]) -> int:
             Out().note(stop.code)
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     return 0
+
+
+def _interrupted() -> int:
+    Out().note("interrupted; repeat the command")
+    return INTERRUPTED
 
 
 def _refuse(reason: str) -> int:

@@ -70,6 +70,7 @@ def evaluate_command(
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.evaluation.benchmark import BENCHMARK
         from ethbrake_marl.worlds.catalogue import THREE_TESTS, group_of_scenarios
+        from ethbrake_marl.worlds.physics import departures_by
 
         chosen = read_settings(settings, of_command=("harm_count", "measures"))
         if not isinstance(chosen.command.get("measures", ""), str):
@@ -80,7 +81,7 @@ def evaluate_command(
             raise InvalidInput(
                 f"--report: cannot be used with {scenario}, a group of {len(names)} scenarios; name one scenario"
             )
-        if report and (physics := chosen.change_scenario(scenario).physics) is not None:
+        if report and departures_by(physics := chosen.change_scenario(scenario).physics):
             raise InvalidInput(
                 f"--report: records episodes, which needs exact impacts, and physics: {physics} has none; leave it out"
             )

@@ -50,10 +50,6 @@ def train_command(
     settings: SettingsOption = None,
     steps: StepsOption = None,
     seed: TrainingSeedOption = None,
-    device: Annotated[
-        str | None,
-        typer.Option(metavar="cpu|cuda|cuda:N", help="Device that trains the policy.", show_default="as in the recipe"),
-    ] = None,
     output: OutputOption = None,
     resume: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Continue the training run in this folder.")
@@ -85,7 +81,7 @@ def train_command(
         if resume is not None:
             options = {
                 "--scenario": scenario, "--recipe": recipe, "--set": settings, "--steps": steps, "--seed": seed,
-                "--device": device, "--output": output, "--force": force or None,
+                "--output": output, "--force": force or None,
             }  # fmt: skip
             for option in (name for name, value in options.items() if value is not None):
                 raise InvalidInput(
@@ -113,7 +109,7 @@ def train_command(
             out.show_progress(progress)
 
         result = train(
-            plan, chosen, folder, steps=steps, seed=seed, device=device, force=force, on_progress=tell,
+            plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell,
             settings=changes.texts,
         )  # fmt: skip
         show_trained(out, result, scenario)

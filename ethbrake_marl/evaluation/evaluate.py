@@ -214,7 +214,7 @@ def evaluate_teams(
     draw = worlds if isinstance(worlds, DrawnWorlds) else DrawnWorlds.from_state(worlds)
     _check(draw.worlds, agents, game)
     chosen = (*DEFAULT, *measures)
-    alert, n, of_worlds = draw.worlds, draw.worlds.n, columns_of(draw)
+    alert, n, of_worlds = game.marked(draw.worlds), draw.worlds.n, columns_of(draw)
     for measure in chosen:
         if measure.name in of_worlds:
             raise InvalidInput(f"measure {measure.name!r}: is the name of a column of the worlds; give another name")

@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
 from ethbrake_marl.evaluation.record import POST_M, advance_worlds, simulate_again, with_post
@@ -254,7 +254,7 @@ WORST5 = Part(
 
 def own_way_m(alert: State, body: int, until_s: float) -> Floats:
     """Distance that a vehicle travels from the alert to ``until_s`` if no other vehicle touches it, [n] m."""
-    check_exact(alert, "pushed_m")
+    require(alert, "pushed_m", simulates=True)
     line, wanted = alert.line[:, :, [0, body]], alert.wanted[:, [0, body]]
     line[:, GAP, 0], line[:, GAP, 1] = POST_M, np.inf
     end_s = np.full(alert.n, until_s)
@@ -306,7 +306,7 @@ def pushed_mps(game: Game, alert: State, last: State) -> MeasureValue:
     pair's first. Without a number: sum over the line; with the number of a vehicle: push by the vehicle behind it;
     obstacle: push of Vehicle 1 against the obstacle.
     """
-    check_exact(last, "pushed_mps")
+    require(last, "pushed_mps", simulates=True)
     of_pair = last.line[:, PUSHED]
     behind = {f"{i}": of_pair[:, i] for i in range(1, last.vehicles)}
     return {"": of_pair.sum(axis=1), **behind, "obstacle": of_pair[:, 0]}

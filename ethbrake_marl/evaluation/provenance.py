@@ -11,22 +11,31 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.episode.departures import PLAIN_ROWS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.files.python_file import files_run
-from ethbrake_marl.motion.layout import PUSHED
+from ethbrake_marl.motion.layout import CAR_NAMES, FIRST, FORCE, GAP, HIT, IMPACTS, SPEED, TOTAL
 from ethbrake_marl.registry import versions_used
 
 EVALUATION_PACKAGES = ("ethbrake-marl", "numba", "numpy")
+# Rows of `line` with what vehicles do at the alert, in the order in which they are hashed
+MOTION = [SPEED, FORCE, GAP, HIT, FIRST, TOTAL, IMPACTS]
 KEYS_WITHOUT_EFFECT = ("name", "title", "description", "source")  # keys of a scenario that do not affect an episode
 
 
 def worlds_sha256(worlds: State) -> str:
-    """SHA-256 of worlds at the alert: of the arrays ``line`` (rows before PUSHED), ``car``, ``know`` and ``wanted``.
+    """SHA-256 of worlds at the alert: of the quantities ``MOTION`` and ``PLAIN_ROWS``, of ``know`` and of ``wanted``.
 
-    Numbers are hashed as little-endian 64-bit floats.
+    Numbers are hashed as little-endian 64-bit floats. A further quantity of vehicles (row of ``car``) is hashed with
+    its name, unless it is 0 everywhere.
     """
-    digest = hashlib.sha256()
-    for array in (worlds.line[:, :PUSHED], worlds.car, worlds.know, worlds.wanted):
+    digest, arrays = hashlib.sha256(), [worlds.line[:, MOTION], worlds.car[:, PLAIN_ROWS], worlds.know, worlds.wanted]
+    for name in sorted(CAR_NAMES):
+        further = worlds.car[:, CAR_NAMES.index(name)]
+        if CAR_NAMES.index(name) not in PLAIN_ROWS and further.any():
+            digest.update(name.encode())
+            arrays.append(further)
+    for array in arrays:
         digest.update(f"{array.shape}".encode())
         digest.update(np.ascontiguousarray(array, "<f8").data)
     return digest.hexdigest()

@@ -11,7 +11,7 @@ import numpy as np
 
 from ethbrake_marl.agents.team import Team, play
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.motion.interval import move_line, move_lines
 from ethbrake_marl.motion.layout import (
@@ -113,7 +113,7 @@ def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPL
 
 def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> list[EpisodeRecord]:
     """Records of several worlds that a team drives, one per world, as by ``record_episode``."""
-    check_exact(worlds, "a record of the motion between decisions")
+    require(game.marked(worlds), "a record of the motion between decisions", simulates=True)
     states = [worlds, *(state for _, state in play(game, worlds, team))]
     return [_record_of([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]
 
@@ -202,7 +202,7 @@ def simulate_again(before: State, after: State, rows: Bools) -> Iterator[tuple[i
     Yields the index of each world, and the scratch memory that the physics has filled (``motion.layout``). There must
     be no decision between the two states.
     """
-    check_exact(before, "a quantity of single impacts")
+    require(before, "a quantity of single impacts", simulates=True)
     scratch = scratch_for(after.vehicles + 1)
     for k in np.flatnonzero(rows).tolist():
         line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))

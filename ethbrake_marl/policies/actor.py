@@ -20,7 +20,7 @@ class Actor:
     """
 
     def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s]) -> None:
-        self.spec, self.actions = spec, spec.actions
+        self.spec = spec
         self.layers = layers_of(tensors, "policy", len(spec.policy_hidden))
 
     def __call__(self, observations: Float32s) -> Float32s:
@@ -38,15 +38,13 @@ class Actor:
     def columns(self, x: Float32s) -> Float32s:
         """Actions [1, rows] for observations that are stored as columns, [F, rows]."""
         y = self.forward(x)
-        if self.spec.output == "choice":
-            return self.actions[np.newaxis, y.argmax(axis=0)]
         if self.spec.output == "clip":
             return np.clip(y, np.float32(-1.0), np.float32(1.0))
         squash(y)
         return y
 
     def forward(self, x: Float32s) -> Float32s:
-        """Outputs of the last layer, [outputs, rows], for observations as columns, [F, rows]."""
+        """Outputs of the last layer, [1, rows], for observations as columns, [F, rows]."""
         for number, (weight, bias) in enumerate(self.layers, 1):
             y = np.empty((len(weight), x.shape[1]), np.float32)
             dense(weight, bias, x, y)

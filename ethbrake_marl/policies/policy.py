@@ -75,7 +75,7 @@ class Policy:
         try:
             draft = Manifest(
                 **{"versions": installed_versions(), **manifest}, network=network,
-                format_version=network.format_version, observation=ObservationSchema.of(observation),
+                observation=ObservationSchema.of(observation),
                 weights_sha256=hashlib.sha256(data).hexdigest(), manifest_sha256="0" * 64,
             )  # fmt: skip
             return cls(
@@ -105,7 +105,7 @@ class Policy:
 
 
 def _manifest_sha256(manifest: Manifest) -> str:
-    return content_sha256(manifest.model_dump(mode="json"))  # keys of earlier versions are not written
+    return content_sha256(manifest.model_dump(mode="json"))
 
 
 def serialise(tensors: Mapping[str, Float32s]) -> bytes:

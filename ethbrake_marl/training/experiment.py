@@ -20,6 +20,7 @@ from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.train import TrainResult, train
+from ethbrake_marl.worlds.physics import departures_by
 from ethbrake_marl.worlds.scenario import Scenario
 
 BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
@@ -95,7 +96,7 @@ def run_experiment(
     Returns the experiment, and the tables and text of the report. Raises ``InvalidInput`` at once for a scenario
     without exact impacts, which shields and reports need.
     """
-    if scenario.physics is not None:
+    if departures_by(scenario.physics):
         raise InvalidInput(
             f"scenario {scenario.name!r}: ethbrake run compares shields, which need exact impacts, and physics:"
             f" {scenario.physics} has none; use ethbrake train and ethbrake evaluate"

@@ -40,6 +40,7 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
+from ethbrake_marl.episode.departures import MARKS
 from ethbrake_marl.episode.layer import Layer
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, Wording, read_model, require, suggestion
@@ -130,7 +131,7 @@ def register_v2x_key(key: str, channel_key: ChannelKey) -> None:
     ``name`` in use; ``AlreadyExists`` for a key of ``v2x`` itself.
     """
     keys, name = getattr(channel_key, "keys", None), getattr(channel_key, "name", None)
-    if name in ("physics", "shaping", "shield"):  # memories that a game has itself
+    if name in (MARKS, "shaping", "shield"):  # memories that a game has itself
         raise InvalidInput(f"key {key!r} of v2x: the name of its memory, {name!r}, is in use; choose another")
     is_named = isinstance(channel_key, ChannelKey) and isinstance(name, str)
     if not is_named or key not in getattr(keys, "model_fields", ()):

@@ -477,11 +477,9 @@ class Layer(torch.nn.Module):
 REFUSED: dict[str, Any] = {
     "agent 'int': policy = 3: must be a function of observations": lambda: policy_agent(3),
     "agent 'Policy': policy = Policy('ppo', 27 observations": lambda: policy_agent(PPO),
-    "agent 'none': policy = 'runs/none': must be the path of an .onnx file; the policy": lambda: policy_agent(
-        "runs/none"
+    "agent 'str': policy = 'runs/none': must be a function of observations, an object with predict or a": lambda: (
+        policy_agent("runs/none")
     ),
-    "none.onnx: the file does not exist": lambda: policy_agent(Path("none.onnx")),
-    "policy: the file is no ONNX model that can be run": lambda: policy_agent(b"\x08\x07 not a model"),
     "agent 'brake': actions = 1: must be a whole number, at least 2": lambda: policy_agent(brake, actions=1),
     "agent 'Sequential': initial_state = <function no_steps": lambda: policy_agent(small_net(), initial_state=no_steps),
     "agent 'ramp': initial_state = 3: must be a function": lambda: policy_agent(ramp, initial_state=3),  # type: ignore[arg-type]

@@ -55,7 +55,6 @@ MARK = re.compile(r"(slow$|not run: |needs |short(?: |$)|except |write |show |ch
 NO_CODE = ("text", "bibtex")
 TINY = "--steps 1 --set evaluation.worlds=10 --set n_envs=16 --set tried=16"
 SHORT = {  # what is added to a command, the first that fits: the last value of an option counts
-    "ethbrake train --recipe rollout-classification": f"{TINY} --set gradient_steps=1",
     "ethbrake train --recipe three-tests": TINY,
     "ethbrake train --recipe preference": TINY,
     "ethbrake train": "--steps 1 --set evaluation.worlds=10",

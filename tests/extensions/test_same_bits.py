@@ -7,7 +7,6 @@ ROUNDED = "degrees to a direction; what is made of it is rounded to millimetres"
 SOLVED = "optima of programmes, whose rates are written down as rounded percentages"
 DRAWN = "corners of a star in a picture, in half pixels"
 REMAINS = {
-    ("learners/rollout_classification.py", "**"): TRAINED,
     ("learners/vine.py", "**"): TRAINED,
     ("recorded/states.py", "np.cos"): ROUNDED,
     ("recorded/states.py", "np.sin"): ROUNDED,

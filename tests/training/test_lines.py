@@ -77,9 +77,6 @@ def test_training__needs_an_algorithm_that_mixes_lines_and_a_learner_in_every_li
     class Mixing(type(TINY)):  # type: ignore[misc]  # the class is a value here
         mixes_lines = True
 
-    on_gpu = Mixing(**TINY.model_dump(mode="json") | {"device": "cuda"})
-    with refused(f"of recipe {TINY.name!r} trains on one line on cuda; use one of the scenarios, or, on cpu, another"):
-        Training.of(on_gpu, LINES)
     with refused("scenario 'cooperation-2-five' has no learner"):
         Training.of(Mixing(**TINY.model_dump(mode="json")), silent)
 

@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.messages.belief import known_pieces
 from ethbrake_marl.extensions.messages.links import (
@@ -150,8 +151,10 @@ class MedianLine(NamedTuple):
         """Median lines at the alert, one for each world of ``alert``.
 
         They contain what the vehicle knows at the first decision, ``state``. Vehicles that are completely known by then
-        start as in the true worlds ``alert``, and so do the gaps between them.
+        start as in the true worlds ``alert``, and so do the gaps between them. Raises ``InvalidInput`` for worlds that
+        depart from what the vehicle can estimate.
         """
+        require(alert, "an estimated line", SHOWN)
         news = self.received(state)
         known = np.asarray(news.pieces[:, :, :P_INTENT].all(axis=2))
         known[:, 0] = known[:, 1]

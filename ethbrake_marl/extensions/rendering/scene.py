@@ -9,7 +9,7 @@ import numpy as np
 
 from ethbrake_marl.episode.commands import action_of
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.evaluation.record import advance_worlds
 from ethbrake_marl.motion.layout import (
     FAR_M,
@@ -90,7 +90,7 @@ class Scene(NamedTuple):
 
     def share(self, body: int) -> float:
         """Command in effect as an action: -1 brakes as hard as the vehicle can, 1 drives as hard as it can."""
-        return float(action_of(self.car, body, self.command(body), self.time_s))
+        return float(action_of(self.car, body, self.command(body)))
 
     def said_of(self, body: int) -> str:
         """What a vehicle does, in words such as "brakes 3.0 m/s2"."""
@@ -135,11 +135,11 @@ class Scene(NamedTuple):
 class Motion:
     """Exact motion of one world between two decisions, from which scenes are taken.
 
-    Raises ``InvalidInput`` for a world whose physics has no exact impacts.
+    Raises ``InvalidInput`` for a world of another physics.
     """
 
     def __init__(self, game: Game, state: State, row: int) -> None:
-        check_exact(state, "a picture")
+        require(state, "a picture", simulates=True)
         self.game, self.row, self.road_m = game, row, whole_road(state, row)
         self.line, self.car, self.wanted = state.line[row].copy(), state.car[row], state.wanted[row].copy()
         self.start_s = self.until_s = float(state.time_s[row])

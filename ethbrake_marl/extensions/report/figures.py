@@ -205,7 +205,7 @@ def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float)
 
     Rows: first-impact harm predicted by the paper's closed form; simulated first-impact harm; simulated total harm.
     """
-    braking, wait = np.ascontiguousarray(capacities(world.car, BRAKING, world.time_s)[0]), world.car[0, LATENCY].copy()
+    braking, wait = np.ascontiguousarray(capacities(world.car, BRAKING)[0]), world.car[0, LATENCY].copy()
     priced: Any = harm_of_deceleration
     predicted = [priced(world.line[0], braking, wait, body, float(a)) for a in at]
     return np.stack([predicted, *hold(world, world.wanted, [body], -at[None, :, None], horizon_s, "first")[:, 0]])

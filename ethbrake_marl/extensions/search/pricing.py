@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, pair_amount, unshared_amount, weights_of
+from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
-from ethbrake_marl.episode.state import END, ENDED, FIRST_DECISION, LAST, STEPS, State, check_exact
+from ethbrake_marl.episode.state import END, ENDED, FIRST_DECISION, LAST, STEPS, State, require
 from ethbrake_marl.episode.step import advance, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
@@ -281,7 +282,7 @@ def problem_of(
     Raises ``InvalidInput`` for vehicles that do not exist, an unknown count, an objective that is not a weighted sum of
     harm or ``maximin``, and a script that observes the state, whose commands are not known at the alert.
     """
-    check_exact(alert, "a search for the best braking")
+    require(game.marked(alert), "a search for the best braking", SHOWN)
     check_count("count", count)
     chosen = np.array(game.settings.learners if bodies is None else bodies, np.int64)
     if not len(chosen) or len(np.intersect1d(chosen, range(1, alert.vehicles + 1))) < len(chosen):
@@ -306,7 +307,7 @@ def problem_of(
 def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
     """Worlds at the alert in which the vehicles ``bodies`` brake fully, whatever their roles say."""
     wanted = alert.wanted.copy()
-    wanted[:, bodies] = -capacities(alert.car, BRAKING, alert.time_s)[:, bodies]
+    wanted[:, bodies] = -capacities(alert.car, BRAKING)[:, bodies]
     return alert._replace(wanted=wanted)
 
 

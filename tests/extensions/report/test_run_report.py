@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import _EXTRA_OF
+from ethbrake_marl.errors import EXTRA_OF
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, is_papers_test, printed_sheet
 from ethbrake_marl.extensions.report.run import learners_sheets, typical_row_of
@@ -193,5 +193,5 @@ def test_evaluate__by_force_leaves_no_file_of_earlier_results(ethbrake: Command,
 
 
 def test_report__is_imported_where_no_package_of_an_extra_can_be() -> None:
-    absent = "".join(f"sys.modules[{name!r}] = None\n" for name in sorted(_EXTRA_OF))
+    absent = "".join(f"sys.modules[{name!r}] = None\n" for name in sorted(EXTRA_OF))
     assert ended(f"import sys\n{absent}from ethbrake_marl.extensions import report") == (0, "", "")
