@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     # The game: its state, its one step, what would happen
     from ethbrake_marl.agent_names import open_game as open_game
-    from ethbrake_marl.episode.game import Game as Game
+    from ethbrake_marl.episode.game import Game as Game, Physics as Physics, Shield as Shield
     from ethbrake_marl.episode.state import State as State
     from ethbrake_marl.episode.step import Step as Step
     from ethbrake_marl.episode.hold import hold as hold
@@ -80,9 +80,18 @@ if TYPE_CHECKING:
     from ethbrake_marl.episode.terms import register_term as register_term
     from ethbrake_marl.training.recipe import register_algorithm as register_algorithm
     from ethbrake_marl.episode.objectives import register_objective as register_objective
-    from ethbrake_marl.episode.features import register_feature as register_feature
+    from ethbrake_marl.episode.features import (
+        register_feature as register_feature,
+        register_feature_group as register_feature_group,
+    )
+    from ethbrake_marl.episode.layer import Layer as Layer
+    from ethbrake_marl.worlds.physics import register_physics as register_physics
     from ethbrake_marl.worlds.catalogue import register_scenarios as register_scenarios
-    from ethbrake_marl.worlds.channel import register_preset as register_preset
+    from ethbrake_marl.worlds.channel import (
+        ChannelKey as ChannelKey,
+        register_preset as register_preset,
+        register_v2x_key as register_v2x_key,
+    )
     from ethbrake_marl.registry import Part as Part
 
     # Errors

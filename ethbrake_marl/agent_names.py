@@ -21,9 +21,10 @@ from inspect import signature
 from itertools import product
 from typing import Any
 
-from ethbrake_marl.agents.team import UNSTATED, Agent, Team, check_agent, check_knows
+from ethbrake_marl.agents.team import Agent, Team, check_agent, check_knows
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game, Script
+from ethbrake_marl.episode.layer import UNSTATED
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, UnknownName, describe_error
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.registry import Registry
@@ -93,7 +94,7 @@ def register_agent(
         make: ``make(argument, settings)`` returns the agent or a team; ``argument`` is the text after the colon, or
             None. For a group: a list of specs.
         about: description in one line.
-        knows: what the agent needs to know: one of ``agents.team.KNOWLEDGE``.
+        knows: what the agent needs to know: one of ``episode.layer.KNOWLEDGE``.
         form: how the name is written, as ``NAME[:ARGUMENT][@PATH]``; None: the name, with or without an argument.
 
     """

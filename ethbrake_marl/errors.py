@@ -235,7 +235,11 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     names, text = sorted({*known}), name if isinstance(name, str) else ""
     longer = [known_name for known_name in names if known_name.startswith(text)]
     close = longer if len(longer) <= _MOST_SUGGESTED and longer else get_close_matches(text, names, n=1)
-    advice = f"; your own {kind} must be registered or installed first (docs/extend.md)" if may_be_own else ""
+    advice = (
+        f"; your own {kind} must be registered first, for instance by --load FILE.py (docs/extend.md)"
+        if may_be_own
+        else ""
+    )
     hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"known: {', '.join(names) or 'none'}{advice}"
     first = re.split("[,:+@]", text)[0]
     tables = {other: resolve_name(place) for other, place in NAMES.items() if kind in NAMES and other != kind}

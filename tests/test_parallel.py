@@ -25,3 +25,21 @@ def test_process__that_is_killed_is_an_error_and_each_has_one_thread() -> None:
     assert [*run_each(((os.getenv, "OMP_NUM_THREADS") for _ in range(3)), 2)] == ["1"] * 3
     with pytest.raises(WorkerLost, match="use fewer processes"):
         list(run_each([(os._exit, 3)], 2))
+
+
+
+@pytest.mark.parametrize(("cores", "jobs", "processes", "share"), [(5, 2, 2, 2), (3, 8, 3, 1), (2, 2, 2, 1)])
+def test_processes_and_their_threads__are_never_more_than_the_cores(
+    cores: int, jobs: int, processes: int, share: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    joblib = pytest.importorskip("joblib")
+    sizes, parallel_class = list[int](), joblib.Parallel
+
+    def counted(size: int, **settings: object) -> object:
+        sizes.append(size)
+        return parallel_class(size, **settings)
+
+    monkeypatch.setattr(joblib, "Parallel", counted)
+    monkeypatch.setattr(parallel, "usable_cores", lambda: cores)
+    assert [*run_each(((parallel.chosen_threads, 64) for _ in range(3)), jobs)] == [share] * 3
+    assert sizes == [processes]

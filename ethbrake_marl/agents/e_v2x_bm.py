@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.pairwise import ConstantDeceleration, closed_form, pairwise
-from ethbrake_marl.agents.team import MODEL, NO_BODIES, STATE
+from ethbrake_marl.agents.team import NO_BODIES, PREDICTED
 from ethbrake_marl.episode.hold import hold
+from ethbrake_marl.episode.layer import MODEL, STATE
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import StepSettings, failure, first_decision, step
 from ethbrake_marl.errors import InvalidInput
@@ -142,7 +143,14 @@ class BaselineMemory(NamedTuple):
     predicted_harm: Floats  # [n] m2/s2
 
 
-class EV2XBM:
+class Predicting:
+    """Base class of agents whose memory has ``predicted_harm``, which evaluations report where it is finite."""
+
+    def measures(self, last: State, memory: Any, body: int) -> dict[str, Floats]:
+        return {PREDICTED: memory.predicted_harm} if np.isfinite(memory.predicted_harm).all() else {}
+
+
+class EV2XBM(Predicting):
     """Brakes with the deceleration of ``coupled``, assuming that the other learners brake fully.
 
     If they do, the predicted harm is, to the last bit, the harm of the episode. ``agents``: vehicle (1: Vehicle 1) ->
@@ -177,7 +185,7 @@ class EV2XBM:
         return memory.command, memory
 
 
-class EV2XBMPairwise:
+class EV2XBMPairwise(Predicting):
     """Brakes with the deceleration of ``pairwise``, the paper's closed form."""
 
     name, knows = "e_v2x_bm:pairwise", STATE

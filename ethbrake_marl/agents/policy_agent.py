@@ -33,8 +33,18 @@ class RangeMemory(NamedTuple):
     outside: Ints  # [n] number of decisions so far outside the range of the policy's training
 
 
+@dataclass(frozen=True, kw_only=True)
+class RangeObserver(Observer):
+    """Base class of agents that count the decisions outside the range of their training in a ``RangeMemory``."""
+
+    def measures(self, last: State, memory: Any, body: int) -> dict[str, Floats]:
+        if not isinstance(memory, RangeMemory):
+            return {}
+        return {"outside": memory.outside / np.maximum(last.steps, 1)}
+
+
 @dataclass(frozen=True)
-class LearnedAgent(Observer):
+class LearnedAgent(RangeObserver):
     """Drives with the deterministic actions of a policy of this package.
 
     >>> import ethbrake_marl as eb
@@ -97,7 +107,7 @@ class LearnedAgent(Observer):
 
 
 @dataclass(frozen=True)
-class PolicyAgent(Observer):
+class PolicyAgent(RangeObserver):
     """Drives with a policy of another library; made by ``policy_agent``. It can be pickled if the policy can."""
 
     policy: Any

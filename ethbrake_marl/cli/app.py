@@ -12,6 +12,7 @@ import threading
 import warnings
 from _thread import interrupt_main
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from functools import cache
 from typing import Annotated, Any
 
@@ -64,6 +65,7 @@ def _about(
 
 
 def main() -> None:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy starts threads of its own: one core unless asked
     gc.set_threshold(20_000)  # Python's default of 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
     prepare_streams()
     sys.unraisablehook = repeat_interrupt
@@ -215,7 +217,7 @@ class Installed(TyperCommand):
     def command(self) -> Any:
         command = COMMANDS[self.entry]
         command.name = self.name
-        return with_installed(command, self.entry)
+        return with_load(with_installed(command, self.entry))
 
     def make_context(self, *arguments: Any, **settings: Any) -> Any:
         return self.command().make_context(*arguments, **settings)
@@ -252,4 +254,50 @@ def _build_commands(*registered: object) -> Any:
         group = get_group(typer.Typer(name=name, help="Commands of installed packages.", add_completion=False))
         program.commands[name] = with_installed(group, name)
     program.commands["doctor"] = program.commands.pop("doctor")  # the last one of the help
-    return program
+    return with_load(program)
+
+
+def with_load(command: Any) -> Any:
+    """The command, or each of a group that is not ``Installed``, with the option ``--load FILE.py``."""
+    if hasattr(command, "commands"):
+        for inside in command.commands.values():
+            with_load(inside)
+    elif not isinstance(command, Installed) and LOAD not in command.params:
+        command.params.append(LOAD)
+    return command
+
+
+def _load_files(context: typer.Context, files: list[str] | None) -> None:
+    from ethbrake_marl.files.python_file import load_file
+
+    if not context.resilient_parsing:
+        with redirect_stdout(sys.stderr):
+            for file in files or ():
+                load_file(file)
+
+
+LoadOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--load",
+        metavar="FILE.py",
+        is_eager=True,
+        callback=_load_files,
+        help="Run a Python file that registers components of your own (docs/extend.md). Can be given several times.",
+    ),
+]
+
+
+def _only_load(load: LoadOption = None) -> None:
+    """Signature from which Typer makes the option ``--load`` of every command."""
+
+
+def _option_of(function: Callable[..., Any]) -> Any:
+    command = typer.Typer(add_completion=False)
+    command.command()(function)
+    (option,) = [option for option in get_command(command).params if option.name == "load"]
+    option.expose_value = False
+    return option
+
+
+LOAD = _option_of(_only_load)

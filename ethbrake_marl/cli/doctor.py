@@ -16,6 +16,7 @@ from ethbrake_marl import __version__
 from ethbrake_marl.cli.command import JsonOption, Out
 from ethbrake_marl.errors import EXTRA_OF
 from ethbrake_marl.kernel_cache import UNSTORED, cache_folder, delete_damaged, obstacle
+from ethbrake_marl.parallel import VARIABLE, chosen_threads, usable_cores
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -67,9 +68,11 @@ def _dependencies() -> Iterator[Check]:
 
 
 def _processor() -> tuple[bool, str]:
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = os.environ.get("OMP_NUM_THREADS", "not set")
-    return True, f"{usable} of {os.cpu_count()} cores usable; OMP_NUM_THREADS {threads}; training uses one torch thread"
+    return True, (
+        f"{usable_cores()} of {os.cpu_count()} cores usable; {chosen_threads(None)} used unless you ask for more"
+        f" (--jobs, {VARIABLE}); OMP_NUM_THREADS {threads}; training uses one torch thread"
+    )
 
 
 def _kernel_cache() -> tuple[bool, str]:

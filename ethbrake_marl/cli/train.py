@@ -22,6 +22,15 @@ AFTER_STOPPED_TRAINING = (
     " an unfinished training"
 )
 
+TrainingScenarioOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME|PATH",
+        help="Name of a shipped or registered scenario, or path of a YAML file.",
+        show_default="the recipe's, or paper-random",
+    ),
+]
+
 TrainingSeedOption = Annotated[
     int | None, typer.Option(help="Seed of the training run.", show_default="as in the recipe")
 ]
@@ -33,14 +42,7 @@ OutputOption = Annotated[
 
 
 def train_command(
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|PATH",
-            help="Name of a shipped or registered scenario, or path of a YAML file.",
-            show_default="paper-random",
-        ),
-    ] = None,
+    scenario: TrainingScenarioOption = None,
     recipe: Annotated[
         str | None,
         typer.Option(metavar="NAME|PATH", help="Name of a shipped recipe, or path of a YAML file.", show_default="ppo"),
@@ -94,7 +96,7 @@ def train_command(
             raise InvalidInput("--other-versions: has no effect on a new run; use it only with --resume FOLDER")
         plan = load_recipe(recipe or "ppo")
         changes = read_settings(settings, [*type(plan).model_fields])
-        chosen = changes.change_scenario(scenario or "paper-random")
+        chosen = changes.change_scenario(scenario or plan.scenario or "paper-random")
         plan = change_recipe(plan, changes.recipe, out)
         begun = [Training.of(plan, chosen).who_drives()]
         folder = output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed)

@@ -7,18 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agent_names import open_game, require_learner, teams_of
-from ethbrake_marl.agents.team import CHUNK, KNOWLEDGE, MODEL, UNSTATED, Team, check_knows, play
+from ethbrake_marl.agents.team import CHUNK, Team, agents_measures, check_knows, play
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import KNOWLEDGE, MODEL, UNSTATED
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
-from ethbrake_marl.evaluation.measure_registry import measures_called
+from ethbrake_marl.evaluation.measure_registry import check_measure_name, measures_called
 from ethbrake_marl.evaluation.measures import DEFAULT, Measure, MeasureValues, Watch, measure_columns, naming
 from ethbrake_marl.evaluation.provenance import about_scenario, policy_digests, versions, worlds_sha256
 from ethbrake_marl.motion.digest import physics_digest
@@ -31,6 +32,7 @@ from ethbrake_marl.worlds.sampling import DrawnWorlds
 Columns = dict[str, MeasureValues]
 
 EPISODES, SEED = 10_000, 7  # the evaluation list
+REPORTED = "What the agent, the shield or a layer reports of itself."  # meaning of its measures
 
 
 @dataclass(frozen=True)
@@ -219,20 +221,21 @@ def evaluate_teams(
         (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)
         for first in range(0, n, CHUNK)
     )
-    parts: list[dict[str, Columns]] = []
+    parts: list[dict[str, Driven]] = []
     for part in run_each(calls, jobs):
         parts.append(part)
         if on_done is not None:
             on_done(min(len(parts) * CHUNK, n))
+    reported = dict.fromkeys(name for part in parts for driven in part.values() for name in driven.reported)
     learners = game.settings.learners.tolist()
     columns: Columns = {**of_worlds}
     if (columns["world"] < 0).all():  # the user has made these worlds
         columns["world"] = np.arange(n)
     return Result(
-        {team: _join_columns([part[team] for part in parts]) for team in agents},
+        {team: _join_columns([part[team].columns for part in parts]) for team in agents},
         {**columns, "hidden": hidden_from(alert, game)},
-        chosen,
-        {name: known_by(team) for name, team in agents.items()},
+        (*chosen, *(Measure(name, meaning=REPORTED) for name in reported)),
+        {name: known_by(team, game) for name, team in agents.items()},
         {name: {f"vehicle_{i}": agent.name for i, agent in team.drivers.items()} for name, team in agents.items()},
         {name: policy_digests(team.drivers) for name, team in agents.items()},
         {
@@ -251,13 +254,18 @@ def evaluate_teams(
     )
 
 
-def drive_chunk(
-    alert: State, agents: Mapping[str, Team], game: Game, measures: Sequence[Measure]
-) -> dict[str, Columns]:
+class Driven(NamedTuple):
+    """Columns of a team in some worlds."""
+
+    columns: Columns
+    reported: tuple[str, ...]  # names of the measures that only the team itself knows
+
+
+def drive_chunk(alert: State, agents: Mapping[str, Team], game: Game, measures: Sequence[Measure]) -> dict[str, Driven]:
     return {name: _drive_team(alert, name, team, game, measures) for name, team in agents.items()}
 
 
-def _drive_team(alert: State, name: str, team: Team, game: Game, measures: Sequence[Measure]) -> Columns:
+def _drive_team(alert: State, name: str, team: Team, game: Game, measures: Sequence[Measure]) -> Driven:
     full_game, start = team.game(game), alert.read_only()
     watches: list[tuple[Measure, Watch]] = []
     for measure in measures:
@@ -274,14 +282,35 @@ def _drive_team(alert: State, name: str, team: Team, game: Game, measures: Seque
             before = state
     last, watched = before.read_only(), {measure.name: watch for measure, watch in watches}
     columns: Columns = {}
+    reports = _reports_of(team, full_game, last)
     for measure in measures:
         with naming(measure):
             if measure.of is not None:
                 value = measure.of(full_game, start, last)
+            elif measure.watch is None:
+                value = reports.pop(measure.name, None)
             else:
                 value = watched[measure.name].result(last) if measure.name in watched else None
         columns |= measure_columns(measure, value, last)
-    return columns
+    for reported, value in reports.items():
+        if reported in columns or reported in [measure.name for measure in measures]:
+            raise InvalidInput(
+                f"team {name!r}: reports the measure {reported!r}, which is in use; its method measures must give"
+                " another name"
+            )
+        check_measure_name(reported)
+        columns |= measure_columns(Measure(reported), value, last)
+    return Driven(columns, tuple(reports))
+
+
+def _reports_of(team: Team, game: Game, last: State) -> dict[str, Any]:
+    """Measures that layers, and the shield or else the agents of a team, report of themselves, name -> value."""
+    reports: dict[str, Any] = {}
+    for layer in game.layers:
+        reports |= layer.measures(last)
+    if team.shield is None:
+        return reports | agents_measures(team.drivers, last, last.memories)
+    return reports | (team.shield.measures(game, last) if hasattr(team.shield, "measures") else {})
 
 
 def _join_columns(parts: Sequence[Columns]) -> Columns:
@@ -305,9 +334,11 @@ def hidden_from(alert: State, game: Game) -> Bools:
     return hidden
 
 
-def known_by(team: Team) -> str:
-    """What a team must know, in words such as ``messages + true model``."""
-    return " + ".join(word for word in (*KNOWLEDGE, UNSTATED) if word in _knowledge_of(team).values())
+def known_by(team: Team, game: Game) -> str:
+    """What a team must know, in words such as ``messages + true model``; with ``filtered`` if it does not say."""
+    knowledge = _knowledge_of(team).values()
+    silent = f"{UNSTATED}, filtered" if game.layers else UNSTATED
+    return " + ".join([*(word for word in KNOWLEDGE if word in knowledge), *[silent] * (UNSTATED in knowledge)])
 
 
 def _knowledge_of(team: Team) -> dict[str, str]:

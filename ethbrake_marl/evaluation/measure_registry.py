@@ -67,12 +67,7 @@ def _check_measure(
     statistics: Iterable[Statistic] = (),
     watch: Callable[[Game, State], Watch | None] | None = None,
 ) -> Measure:
-    right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
-    if not isinstance(name, str) or re.fullmatch(right, name) is None:
-        raise InvalidInput(
-            f"measure {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter and not"
-            " ending in _ and a number, nor in _interval, _low, _high, _error or _freedom"
-        )
+    check_measure_name(name)
     function = watch if of is None else of
     if (of is None) == (watch is None) or not callable(function) or not (function.__doc__ or "").strip():
         raise InvalidInput(
@@ -82,6 +77,15 @@ def _check_measure(
     if name in (*DEFAULT_MEASURES, *RESERVED_NAMES) or name in TERMS:
         raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
     return Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(statistics), watch)
+
+
+def check_measure_name(name: object) -> None:
+    right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
+    if not isinstance(name, str) or re.fullmatch(right, name) is None:
+        raise InvalidInput(
+            f"measure {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter and not"
+            " ending in _ and a number, nor in _interval, _low, _high, _error or _freedom"
+        )
 
 
 DEFAULT_MEASURES = tuple(measure.name for measure in DEFAULT)
@@ -162,8 +166,15 @@ def _measures_named(name: str) -> list[Measure]:
 
 
 def _of_file(file: str, name: str) -> Measure:
-    """Measure of a user's file: a function, or a ``Part`` with arguments of ``register_measure``."""
+    """Measure ``name`` of a user's Python file: a function, or a ``Part`` with arguments of ``register_measure``.
+
+    It may be a function that the file itself registers under this name, also as a term of a reward.
+    """
     value = load_from_file(file, name)
+    if name in TERMS and TERMS[name].value is value:
+        return _sum_of_term(name, TERMS[name].value, TERMS[name].unit)
+    if name in MEASURES and value in (MEASURES[name].of, MEASURES[name].watch):
+        return MEASURES[name]
     part = value if isinstance(value, Part) else Part(value)
     try:
         measure = _check_measure(**signature(register_measure).bind(name, *part.arguments, **part.settings).arguments)

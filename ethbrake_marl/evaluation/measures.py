@@ -26,6 +26,9 @@ property of a state                      meaning (``episode.state.State``)
 A ``Watch`` also sees each step (``episode.step.Step``): ``first_impact_harm`` and ``total_harm`` of the line, [n]
 m2/s2; ``reward`` [n, N] and its ``terms``; ``terminated``, ``truncated`` and ``safe_end``, [n].
 
+An agent, a shield or a layer may report measures of its own (``agents.team.Agent``, ``episode.game.Shield``,
+``episode.layer.Layer``): a mapping name -> value, with values of the same form.
+
 Every evaluation has the measures in DEFAULT. Costly ones are chosen by name: ``evaluation.measure_registry``.
 """
 
@@ -88,6 +91,7 @@ class Measure(NamedTuple):
     unit: str = "1"
     statistics: tuple[Statistic, ...] = ()  # of its columns; a column without any gets its mean or rate
     watch: Callable[[Game, State], Watch | None] | None = None  # makes a `Watch` from (game, alert)
+    # without `of` and `watch`: a value that agents, shields or layers report by their own method `measures`
 
 
 def measure_columns(measure: Measure, measurement: MeasureValue, last: State) -> dict[str, MeasureValues]:
@@ -164,39 +168,6 @@ def ended(game: Game, alert: State, last: State) -> MeasureValue:
     return np.where(last.moving, HORIZON, AT_REST)
 
 
-def predicted_harm(game: Game, alert: State, last: State) -> MeasureValue:
-    """Harm that an agent or a shield predicted at the alert, in the count of harm that it minimises. Defined if exactly
-    one agent or shield predicts.
-    """
-    memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.settings.learners.tolist())]
-    predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
-    return predictions[0] if len(predictions) == 1 and np.isfinite(predictions[0]).all() else None
-
-
-def replaced(game: Game, alert: State, last: State) -> MeasureValue:
-    """actions: number of actions that the shield replaced; none: whether it replaced no action. A shield that chooses
-    once per episode (Algorithm 1) has only none: whether it chose the policy.
-    """
-    memory: Any = last.memories.get("shield")
-    if hasattr(memory, "chosen"):
-        return {"none": memory.chosen}
-    if hasattr(memory, "replaced"):
-        return {"actions": memory.replaced, "none": memory.replaced == 0}
-    return None
-
-
-def outside(game: Game, alert: State, last: State) -> MeasureValue:
-    """Share of a trained policy's decisions outside the range of what it observed in training; for several learners
-    with such policies, their mean.
-    """
-    shield: Any = last.memories.get("shield")
-    memories: Any = [last.memories.get(body) for body in game.settings.learners.tolist()]
-    if shield is not None:
-        memories = getattr(shield, "agents", [getattr(shield, "agent", None)])
-    outside = [memory.outside for memory in memories if hasattr(memory, "outside")]
-    return np.asarray(np.mean(outside, axis=0) / np.maximum(last.steps, 1)) if outside else None
-
-
 def _built_in(of: Callable[[Game, State, State], MeasureValue], unit: str, *statistics: Statistic) -> Measure:
     return Measure(of.__name__, of, of.__doc__ or "", unit, statistics)
 
@@ -237,9 +208,23 @@ DEFAULT = (
     _built_in(hardest_impact_mps, "m/s"),
     _built_in(end_s, "s"),
     _built_in(ended, ""),
-    _built_in(predicted_harm, "m2/s2", Statistic("predicted_harm", "mean", "Predicted harm", "Pre-\ndicted")),
-    _built_in(outside, "1"),
-    _built_in(replaced, "1", Statistic("policy_share", "rate", ending="none")),
+    Measure(
+        "predicted_harm", None,
+        "Harm that an agent predicted at the alert, in the count of harm that it minimises. Defined if exactly one"
+        " agent predicts.", "m2/s2",
+        (Statistic("predicted_harm", "mean", "Predicted harm", "Pre-\ndicted"),),
+    ),
+    Measure(
+        "outside", None,
+        "Share of a trained policy's decisions outside the range of what it observed in training; for several learners"
+        " with such policies, their mean.",
+    ),
+    Measure(
+        "replaced", None,
+        "actions: number of actions that the shield replaced; none: whether it replaced no action. A shield that"
+        " chooses once per episode (Algorithm 1) has only none: whether it chose the policy.", "1",
+        (Statistic("policy_share", "rate", ending="none"),),
+    ),
 )  # fmt: skip
 
 

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.team import MODEL, STATE
 from ethbrake_marl.episode.counts import COLUMN
+from ethbrake_marl.episode.layer import MODEL, STATE
 from ethbrake_marl.errors import InvalidInput, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.evaluate import Result

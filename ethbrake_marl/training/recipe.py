@@ -96,6 +96,13 @@ class TrainingRecipe(FileModel):
     title: str = Field("", description="title in one line")
     description: str = Field("", description="what the recipe is for")
     source: str = Field("", description="where the values come from")
+    scenario: str | None = Field(
+        None,
+        pattern=NAME_PATTERN,
+        exclude_if=not_,
+        description="name of the scenario on which `ethbrake train` and `ethbrake run` train, unless --scenario names"
+        " another one; if missing, paper-random",
+    )
     algorithm: str = Field(
         description="name of the learning algorithm: ppo, sac, or another registered one (ethbrake scenario parts)"
     )

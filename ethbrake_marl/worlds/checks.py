@@ -80,9 +80,9 @@ def _check_channel(scenario: Scenario) -> None:
     right = "works only with v2x: paper, because messages before the alert are not modelled"
     require(scenario.alert_s is None or not v2x.by_link, ("alert_s",), scenario.alert_s, right)
     right = f"is not known to physics: {scenario.physics}; leave one of the two out"
-    require(not v2x.extensions or not departures_by(scenario.physics), ("v2x",), UNSHOWN, right)
-    for extension in v2x.extensions:
-        extension.check(scenario)
+    require(not v2x.channel_keys or not departures_by(scenario.physics), ("v2x",), UNSHOWN, right)
+    for channel_key in v2x.channel_keys:
+        channel_key.check(scenario)
 
 
 def _check_roles(scenario: Scenario) -> None:

@@ -192,9 +192,7 @@ def state_of(scenario: Scenario, quantities: QuantityValues, numbers: Numbers, u
         know[rows, 1:, 1:] = reaction_time[rows]
     for i, name in enumerate(scenario.vehicle_names):
         wanted[:, i + 1] = first_command(scenario.roles[name], quantities["braking_capacity_mps2"][:, i])
-    memories = {
-        extension.name: extension.at_alert(scenario, numbers, unheard, n) for extension in scenario.v2x.extensions
-    }
+    memories = {key.name: key.at_alert(scenario, numbers, unheard, n) for key in scenario.v2x.channel_keys}
     return mark(at_alert(line, car, know, wanted, index)._replace(memories=memories), departures_by(scenario.physics))
 
 

@@ -272,7 +272,7 @@ def check_predictable(scenario: Scenario, body: int) -> None:
     if scenario.members:
         names = ", ".join(member.name for member in scenario.members)
         raise InvalidInput(f"{where} the ranges of one scenario, but this is a mixture; give one of {names}")
-    false = [extension.name for extension in scenario.v2x.extensions if extension.name != MESSAGES_KEY]
+    false = [channel_key.name for channel_key in scenario.v2x.channel_keys if channel_key.name != MESSAGES_KEY]
     if false:
         raise InvalidInput(f"{where} messages without errors; leave {', '.join(false)} out of v2x, or use shield step")
     for vehicle, (name, role) in enumerate(scenario.roles.items(), 1):

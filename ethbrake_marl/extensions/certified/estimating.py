@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.team import ESTIMATED, Agent
+from ethbrake_marl.agents.team import Agent
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import ESTIMATED
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.estimated import MedianLine, without_channel

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.team import MODEL, Agent
+from ethbrake_marl.agents.team import Agent
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import hold
+from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.state import END, State, map_arrays, take
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty

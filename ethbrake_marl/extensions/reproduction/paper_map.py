@@ -197,7 +197,7 @@ def with_commands(game: Game, state: State, actions: Floats | None) -> State:
     proposals = proposal_array(learners, actions, state.n)
     if np.isnan(proposals).any():
         check_actions(learners, proposals[np.isnan(proposals).any(axis=1).argmax()])
-    state = ask_scripts(game.scripts, state)
+    state = ask_scripts(game.agents(game.scripts), state)
     commands = commands_of(state, learners, proposals)
     state.wanted[:, learners] = np.where(state.ended[:, np.newaxis], state.wanted[:, learners], commands)
     return state

@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agent_names import AgentSettings, make_agent
-from ethbrake_marl.agents.team import MODEL, Agent, Team
+from ethbrake_marl.agents.e_v2x_bm import Predicting
+from ethbrake_marl.agents.team import Agent, Team
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.extensions.search.best_harm import SEARCH_BUDGET, agent_commands, e_v2x_bm_profiles
@@ -36,7 +38,7 @@ class SearchMemory(NamedTuple):
     predicted_harm: Floats  # [n] m2/s2
 
 
-class Planner:
+class Planner(Predicting):
     """Agent that chooses all its commands at the alert, as if other learners braked fully.
 
     If they do, the harm that happens is the memory's ``predicted_harm``, to the last bit.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from ethbrake_marl.extensions.search.search import compact, search_profiles
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.parallel import chosen_threads
 
 SEARCH_BUDGET = 20_000  # profiles that are simulated in each world, in each count
 SEARCH_CHUNK = 200  # worlds that are searched together
@@ -54,7 +54,7 @@ def best_harm(
         bodies: vehicles that are controlled (1: Vehicle 1); None: the learners.
         budget: number of profiles that are simulated in each world, for each count.
         seed: seed of the random search.
-        threads: number of threads; None: one for each core.
+        threads: number of threads; None: the environment variable ``ETHBRAKE_THREADS``, or 1.
         first_profiles: profiles that are tried first, [n] each, with any number of phases.
         objective: what is minimised, as in a scenario's key ``objective``; ``total``: the harm of the line.
 
@@ -64,7 +64,7 @@ def best_harm(
     """
     if not counts or not set(counts) <= set(COUNTS) or len(set(counts)) < len(counts):
         raise InvalidInput(f"counts = {tuple(counts)}: must be some of {', '.join(COUNTS)}, each once")
-    effort = {"budget": budget, "seed": seed, "threads": (os.cpu_count() or 1) if threads is None else threads}
+    effort = {"budget": budget, "seed": seed, "threads": chosen_threads(threads)}
     problem = problem_of(game, alert, bodies, objective=objective)
     outcomes = [(profiles, problem.values(profiles)) for profiles in first_profiles]
     for count in counts:

@@ -12,6 +12,7 @@ from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.extensions.search.kernels import CHANGE, DRAWING, PLAN, STEPWISE, Field, Room, World, gather, improve
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, UInt64s, best_of
 from ethbrake_marl.motion.layout import Floats, Ints, scratch_for
+from ethbrake_marl.parallel import chosen_threads
 
 # of a search for profiles
 DRAWN_SHARE = 0.35  # part of the budget for given and random profiles,
@@ -48,7 +49,8 @@ def search_profiles(
     Raises ``InvalidInput`` for an invalid budget, seed or number of threads, and ``PhysicsError`` for worlds in which
     no profile can be simulated.
     """
-    for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
+    threads = chosen_threads(threads)
+    for name, value, least in (("budget", budget, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)
     n = problem.n
     ends, commands = join_profiles([part.shorten() for part in starts], n)

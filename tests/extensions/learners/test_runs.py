@@ -59,8 +59,7 @@ def test_shipped_recipe__is_like_its_own_content(name: str) -> None:
 def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> None:
     recipe = load_recipe(name)
     few = recipe.replace(n_envs=-(-max(recipe.batch_size, recipe.tried) // recipe.rounds), total_steps=1)
-    of_its_own = {"three-tests": "mixture-three-tests", "preference": "paper-random-preference", "vine": "paper-random"}
-    scenario = of_its_own.get(name, "cooperation-1-front")
+    scenario = recipe.scenario or {"vine": "paper-random"}.get(name, "cooperation-1-front")
     result = train(few, scenario, tmp_path / "run", measure=None, on_progress=None)
     assert result.updates == 1 and eb.load_policy(tmp_path / "run").manifest.algorithm == recipe.algorithm
 
