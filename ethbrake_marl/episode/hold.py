@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.episode.counts import AnyCount, HarmCount, amount_so_far, pair_amount
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacities
@@ -162,7 +162,7 @@ def kernel_inputs(
     ``memory`` is working memory: scratch of the physics, one line, and the commands of this line.
     """
     features = "e_v2x_bm other than pairwise, shields other than episode:pairwise, shaping"
-    check_exact(state, f"a plan of constant commands ({features})")
+    require(state, f"a plan of constant commands ({features})", simulates=True)
     until, bodies = np.full(state.n, until_s, np.float64), np.asarray(bodies, np.int64)
     memory = scratch_for(wanted.shape[1]), np.zeros(state.line.shape[1:]), np.zeros(wanted.shape[1])
     time, trials = state.time_s.copy(), np.ascontiguousarray(trials)
@@ -178,7 +178,7 @@ def descend(
     1]) for the others' latest choice. Commands are held until ``until_s``. Returns the commands of all bodies, [n, N +
     1] m/s2, and the harm of the episode, [n] m2/s2.
     """
-    braking = capacities(state.car, BRAKING, state.time_s)
+    braking = capacities(state.car, BRAKING)
     commands, least = -braking, np.zeros(state.n)
     for body in list(bodies) * rounds:
         trials = -braking[:, [body]] * shares

@@ -38,7 +38,7 @@ from ethbrake_marl.episode.terms import (
     risk,
     still_moving,
 )
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput, UnknownName, unknown_name
 from ethbrake_marl.files.model import UNSHOWN, FileModel, NonNegative, Positive, first_mistake, require
 from ethbrake_marl.motion.layout import Floats, Ints
 
@@ -187,6 +187,8 @@ def reward_params(reward: Reward) -> RewardParams:
     if isinstance(reward, RewardParams):
         return reward
     if isinstance(reward, str):
+        if reward == "paper":
+            raise UnknownName("reward 'paper' has ended; write paper-reward for its four terms, or harm for its count")
         if reward not in REWARDS:
             raise unknown_name("reward", reward, REWARDS)
         return REWARDS[reward]

@@ -32,7 +32,7 @@ class Comparison(NamedTuple):
         measures: Iterable[str] | str = (),
         **more: Any,
     ) -> Comparison:
-        """Evaluate the teams by ``evaluate(..., **more)``, and summarise the result.
+        """Evaluate the teams by ``evaluate(..., **more)``.
 
         For a count that requires exact impacts, the measure ``pushed_mps`` is added.
         """
@@ -44,6 +44,5 @@ class Comparison(NamedTuple):
         return cls(scenario, teams, result, summarise(result), count)
 
     def worlds(self, rows: Iterable[int] | Ints) -> State:
-        """Worlds of the result with the indices ``rows``, at the alert."""
         numbers, seed = self.result.worlds["world"], self.result.about["seed"]
         return State.join([self.scenario.sample(1, seed, first=int(numbers[row])) for row in rows])

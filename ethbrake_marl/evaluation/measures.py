@@ -26,8 +26,11 @@ property of a state                      meaning (``episode.state.State``)
 A ``Watch`` also sees each step (``episode.step.Step``): ``first_impact_harm`` and ``total_harm`` of the line, [n]
 m2/s2; ``reward`` [n, N] and its ``terms``; ``terminated``, ``truncated`` and ``safe_end``, [n].
 
-Every evaluation has the measures in DEFAULT and one for each registered count of harm. Costly ones are
-chosen by name: ``evaluation.measure_registry``.
+An agent, a shield or a layer may report measures of its own (``agents.team.Agent``, ``episode.game.Shield``,
+``episode.layer.Layer``): a mapping name -> value, with values of the same form.
+
+Every evaluation has the measures in DEFAULT and one for each registered count of harm. Costly ones are chosen by name:
+``evaluation.measure_registry``.
 """
 
 from __future__ import annotations
@@ -42,7 +45,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, IMPACT_COUNTS, HarmCount, all_counts
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
 from ethbrake_marl.evaluation.record import POST_M, advance_worlds, simulate_again, with_post
@@ -61,9 +64,7 @@ class Watch(Protocol):
     """A measure that is computed from every step of the episodes."""
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Process one step from ``before`` to ``after``. ``step`` is None for the motion from the alert to the first
-        decision.
-        """
+        """Process one step; ``step`` is None for the motion from the alert to the first decision."""
 
     def result(self, last: State) -> MeasureValue:
         """Value of the measure after the episodes, in a form that a measure's function may return."""
@@ -72,8 +73,8 @@ class Watch(Protocol):
 class Statistic(NamedTuple):
     """Statistic of a measure's column, for tables and JSON.
 
-    The kind ``rate`` is the share of worlds in which the column is true, ``worst`` the mean of its largest 5 %,
-    ``difference`` the mean difference from the baseline, ``decrease`` 1 - (mean) / (mean of the baseline).
+    ``rate``: share of worlds in which the column is true. ``worst``: mean of its largest 5 %. ``difference``: mean
+    difference from the baseline. ``decrease``: 1 - (mean) / (mean of the baseline).
     """
 
     key: str  # name in JSON
@@ -101,16 +102,16 @@ class Measure(NamedTuple):
     unit: str = "1"
     statistics: tuple[Statistic, ...] = ()  # of its columns; a column without any gets its mean or rate
     watch: Callable[[Game, State], Watch | None] | None = None  # makes a `Watch` from (game, alert)
+    # without `of` and `watch`: a value that agents, shields or layers report by their own method `measures`
 
     def all_statistics(self) -> list[Statistic]:
         return [each for statistic in self.statistics for each in statistic.of_counts()]
 
 
 def measure_columns(measure: Measure, measurement: MeasureValue, last: State) -> dict[str, MeasureValues]:
-    """Columns of a measure, name -> [n], from the value that the measure returned.
+    """Columns of a measure, name -> [n], from the value that it returned. ``last``: last states of the episodes.
 
-    ``last``: last states of the episodes. Raises ``InvalidInput`` for a wrong shape or type, and for numbers that are
-    not finite.
+    Raises ``InvalidInput`` for a wrong shape or type, and for numbers that are not finite.
     """
     if measurement is None:
         return {}
@@ -136,7 +137,7 @@ def measure_columns(measure: Measure, measurement: MeasureValue, last: State) ->
 
 @contextmanager
 def naming(measure: Measure) -> Iterator[None]:
-    """Turn an exception in the block into an ``InvalidInput`` that names the measure; errors of this package pass."""
+    """Turn an exception into an ``InvalidInput`` that names the measure; errors of this package pass."""
     try:
         yield
     except EthBrakeError:
@@ -154,10 +155,7 @@ def collided(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 def harm(count: HarmCount, game: Game, alert: State, last: State) -> MeasureValue:
-    """Harm at the end, [n] m2/s2: key ``""`` for the line, ``"1"`` to ``"N"`` for what each vehicle bears.
-
-    None if the count is not defined in these worlds.
-    """
+    """Harm at the end, [n] m2/s2: key ``""`` for the line, ``"1"`` to ``"N"`` for what each vehicle bears."""
     if not last.defines(count):
         return None
     borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}
@@ -182,39 +180,6 @@ def end_s(game: Game, alert: State, last: State) -> MeasureValue:
 def ended(game: Game, alert: State, last: State) -> MeasureValue:
     """How each episode ended. at_rest: all vehicles stand; horizon: a vehicle still moves at the horizon."""
     return np.where(last.moving, HORIZON, AT_REST)
-
-
-def predicted_harm(game: Game, alert: State, last: State) -> MeasureValue:
-    """Harm that an agent or a shield predicted at the alert, in the count of harm that it minimises. Defined if exactly
-    one agent or shield predicts.
-    """
-    memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.settings.learners.tolist())]
-    predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
-    return predictions[0] if len(predictions) == 1 and np.isfinite(predictions[0]).all() else None
-
-
-def replaced(game: Game, alert: State, last: State) -> MeasureValue:
-    """actions: number of actions that the shield replaced; none: whether it replaced no action. A shield that chooses
-    once per episode (Algorithm 1) has only none: whether it chose the policy.
-    """
-    memory: Any = last.memories.get("shield")
-    if hasattr(memory, "chosen"):
-        return {"none": memory.chosen}
-    if hasattr(memory, "replaced"):
-        return {"actions": memory.replaced, "none": memory.replaced == 0}
-    return None
-
-
-def outside(game: Game, alert: State, last: State) -> MeasureValue:
-    """Share of a trained policy's decisions outside the range of what it observed in training; for several learners
-    with such policies, their mean.
-    """
-    shield: Any = last.memories.get("shield")
-    memories: Any = [last.memories.get(body) for body in game.settings.learners.tolist()]
-    if shield is not None:
-        memories = getattr(shield, "agents", [getattr(shield, "agent", None)])
-    outside = [memory.outside for memory in memories if hasattr(memory, "outside")]
-    return np.asarray(np.mean(outside, axis=0) / np.maximum(last.steps, 1)) if outside else None
 
 
 def _built_in(of: Callable[[Game, State, State], MeasureValue], unit: str, *statistics: Statistic) -> Measure:
@@ -251,9 +216,23 @@ DEFAULT = (
     _built_in(hardest_impact_mps, "m/s"),
     _built_in(end_s, "s"),
     _built_in(ended, ""),
-    _built_in(predicted_harm, "m2/s2", Statistic("predicted_harm", "mean", "Predicted harm", "Pre-\ndicted")),
-    _built_in(outside, "1"),
-    _built_in(replaced, "1", Statistic("policy_share", "rate", ending="none")),
+    Measure(
+        "predicted_harm", None,
+        "Harm that an agent predicted at the alert, in the count of harm that it minimises. Defined if exactly one"
+        " agent predicts.", "m2/s2",
+        (Statistic("predicted_harm", "mean", "Predicted harm", "Pre-\ndicted"),),
+    ),
+    Measure(
+        "outside", None,
+        "Share of a trained policy's decisions outside the range of what it observed in training; for several learners"
+        " with such policies, their mean.",
+    ),
+    Measure(
+        "replaced", None,
+        "actions: number of actions that the shield replaced; none: whether it replaced no action. A shield that"
+        " chooses once per episode (Algorithm 1) has only none: whether it chose the policy.", "1",
+        (Statistic("policy_share", "rate", ending="none"),),
+    ),
 )  # fmt: skip
 
 
@@ -278,7 +257,7 @@ WORST5 = Part(
 
 def own_way_m(alert: State, body: int, until_s: float) -> Floats:
     """Distance that a vehicle travels from the alert to ``until_s`` if no other vehicle touches it, [n] m."""
-    check_exact(alert, "pushed_m")
+    require(alert, "pushed_m", simulates=True)
     line, wanted = alert.line[:, :, [0, body]], alert.wanted[:, [0, body]]
     line[:, GAP, 0], line[:, GAP, 1] = POST_M, np.inf
     end_s = np.full(alert.n, until_s)
@@ -287,27 +266,20 @@ def own_way_m(alert: State, body: int, until_s: float) -> Floats:
 
 
 class PushedAway:
-    """Measures how far vehicles end beyond the place that they would reach by the horizon if untouched (a ``Watch``).
-
-    The distance is negative if a vehicle ends short of that place, for instance because an obstacle threw it back.
-    """
+    """Measures how far vehicles end beyond the place that they would reach untouched; negative if thrown back."""
 
     def __init__(self, bodies: list[int], game: Game, alert: State) -> None:
         self.own_way_m = {body: own_way_m(alert, body, game.settings.horizon_s) for body in bodies}
         self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Simulate the step again (``with_post``), and add the distance that Vehicle 1 travels."""
         line = with_post(before)
         from_m = line[:, GAP, 0].copy()
         advance_worlds(line, before.car, before.time_s, after.time_s, after.wanted, scratch_for(line.shape[2]))
         self.way_m += from_m - line[:, GAP, 0]
 
     def result(self, last: State) -> MeasureValue:
-        """Excess distance of each vehicle, vehicle number -> [n] m.
-
-        ``1_far`` [n]: whether the distance of Vehicle 1 exceeds ``PUSHED_FAR_M``.
-        """
+        """Excess distance, vehicle number -> [n] m; ``1_far`` [n]: whether Vehicle 1 exceeds ``PUSHED_FAR_M``."""
         wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
         metres = {
             f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - untouched_m
@@ -330,7 +302,7 @@ def pushed_mps(game: Game, alert: State, last: State) -> MeasureValue:
     pair's first. Without a number: sum over the line; with the number of a vehicle: push by the vehicle behind it;
     obstacle: push of Vehicle 1 against the obstacle.
     """
-    check_exact(last, "pushed_mps")
+    require(last, "pushed_mps", simulates=True)
     of_pair = last.line[:, PUSHED]
     behind = {f"{i}": of_pair[:, i] for i in range(1, last.vehicles)}
     return {"": of_pair.sum(axis=1), **behind, "obstacle": of_pair[:, 0]}
@@ -339,8 +311,8 @@ def pushed_mps(game: Game, alert: State, last: State) -> MeasureValue:
 def first_impact_s(before: State, after: State) -> Floats:
     """Time of the line's first impact if it lies between the two states, [n] s.
 
-    Otherwise ``before.time_s`` after an earlier impact, and ``after.time_s`` if no impact has happened yet. There must
-    be no decision between the two states.
+    Else ``before.time_s`` after an earlier impact, ``after.time_s`` before any. There must be no decision between the
+    two.
     """
     until: Floats = np.where(before.collided, before.time_s, after.time_s)
     for k, scratch in simulate_again(before, after, ~before.collided & after.collided):
@@ -350,19 +322,12 @@ def first_impact_s(before: State, after: State) -> Floats:
 
 
 def driving_s(before: State, after: State, until_s: Floats) -> Floats:
-    """Time between ``before`` and ``until_s`` [n] in which each vehicle has a positive command in force, [n, N] s.
-
-    ``after``: the state after the step, which holds the commands.
-    """
+    """Time from ``before`` to ``until_s`` [n] with a positive command (of ``after``) in force, [n, N] s."""
     begun_s = np.maximum(before.car[:, LATENCY, 1:], before.time_s[:, np.newaxis])
     return np.where(after.commands_mps2 > 0.0, np.maximum(until_s[:, np.newaxis] - begun_s, 0.0), 0.0)
 
 
 class DroveTowards:
-    """Measures the share of the time before a line's first impact in which each vehicle has a positive command
-    (drives).
-    """
-
     def __init__(self, game: Game, alert: State) -> None:
         self.learners, self.time_s = game.settings.learners, np.zeros(alert.n)
         self.driving_s, self.hard = np.zeros((alert.n, alert.vehicles)), np.zeros(alert.n, np.bool_)

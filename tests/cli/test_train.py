@@ -112,8 +112,6 @@ def test_settings__that_should_agree_are_told(ethbrake: Command, tiny_recipe: Pa
     ("words", "text"),
     [
         ("--resume runs/mine --steps 5", "--steps: cannot be combined with --resume"),
-        ("--resume runs/mine --device cuda", "--device: cannot be combined with --resume"),
-        ("--recipe ppo --device cuda", "device = 'cuda': the algorithm ppo cannot train there; every"),
         ("--other-versions", "--other-versions: has no effect on a new run"),
     ],
 )

@@ -292,7 +292,7 @@ def test_named_rewards__are_those_of_the_page() -> None:
         == RewardParams(harm=2.0, harm_count="honest")
         == RewardParams(harm=2.0, harm_count=HONEST)
     )
-    with pytest.raises(InvalidInput, match=r"^unknown reward 'paper'; renamed to paper-reward$"):
+    with pytest.raises(InvalidInput, match=r"^reward 'paper' has ended; write paper-reward"):
         reward_params("paper")
 
 

@@ -28,17 +28,16 @@ PAIR: dict[str, Any] = {
 FULL_BRAKE, COAST, GENTLE = Held("full_brake"), Held("coast"), Held("constant:4.0")
 
 
-class Foretold(NamedTuple):
-    predicted_harm: Any
-
-
 class Foreteller:
     """Brakes fully, and predicts the first gap as its harm."""
 
     name, knows = "foreteller", SENSORS
 
-    def begin(self, alert: State, body: int) -> Foretold:
-        return Foretold(alert.gaps_m[:, 0].copy())
+    def begin(self, alert: State, body: int) -> Any:
+        return alert.gaps_m[:, 0].copy()
+
+    def measures(self, last: State, memory: Any, body: int) -> Any:
+        return {"predicted_harm": memory}
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Any, Any]:
         return -state.braking_capacity_mps2[:, body - 1], memory

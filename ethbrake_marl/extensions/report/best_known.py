@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import HONEST, IMPACT_COUNTS, HarmCount, all_counts
+from ethbrake_marl.episode.counts import IMPACT_COUNTS, HarmCount, all_counts
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.motion.layout import Bools, Floats
@@ -33,29 +33,12 @@ class BestKnown(NamedTuple):
             cls(harm, columns.get(AVOIDABLE_COLUMN), columns.get(UNAVOIDABLE)) if {*IMPACT_COUNTS} <= {*harm} else None
         )
 
-    @property
-    def in_words(self) -> str:
-        """Sentences: mean best known harm, and share of the worlds in which no command avoids an impact."""
-        first, total = (float(self.harm[count].mean()) for count in IMPACT_COUNTS)
-        words = (
-            f"Mean best known harm of these worlds, where pushing is free: {first:.2f} first-impact, {total:.2f} total."
-        )
-        if HONEST in self.harm:
-            words += f" Mean best known honest cost: {self.harm[HONEST].mean():.2f}."
-        if self.unavoidable is None:
-            return words
-        never = 100.0 * float(self.unavoidable.mean())
-        return f"In {never:.1f} % of the worlds, no command avoids an impact (proven). {words}"
-
     def regret(self, result: Result, agent: str, count: HarmCount) -> Floats:
         return np.asarray(result[agent][count.column] - self.harm[count])
 
 
 def shown_counts(compared: Comparison) -> list[HarmCount]:
-    """Counts to show: first-impact harm, total harm, and the count that agents minimise.
-
-    The count that agents minimise is left out if the best known harm has been measured for other counts only.
-    """
+    """First-impact harm, total harm, and what agents minimise, as far as their best is known."""
     best_known = BestKnown.of(compared.result)
     counts = [*dict.fromkeys([*IMPACT_COUNTS, compared.harm_count])]
     return counts if best_known is None else [count for count in counts if count in best_known.harm]
