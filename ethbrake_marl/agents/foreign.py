@@ -214,6 +214,14 @@ def check_wrappers(policy: Any, who: str) -> None:
         )
 
 
+def check_gamma(model: Any, who: str) -> None:
+    """Raise ``InvalidInput`` if a model's discount was too large for the reward of its training environment."""
+    env, gamma = getattr(model, "get_env", lambda: None)(), getattr(model, "gamma", None)
+    for layer in [] if env is None or gamma is None else wrappers_of(env):
+        if type(layer).__module__.startswith("ethbrake_marl.") and hasattr(layer, "game"):
+            layer.game.rewarding.params.check_gamma(gamma, f"{who}: the model was trained with gamma")
+
+
 def wrappers_of(env: Any) -> Iterator[Any]:
     yield env
     for name in WRAPPED_ATTRIBUTES:

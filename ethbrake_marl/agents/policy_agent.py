@@ -17,6 +17,7 @@ from ethbrake_marl.agents.foreign import (
     Ask,
     ask_function,
     ask_of,
+    check_gamma,
     check_wrappers,
     count_of_actions,
     features_of,
@@ -233,8 +234,8 @@ def policy_agent(
         actions: number of discrete actions, evenly spaced from -1 to 1, if the policy returns indices.
         ignore_wrappers: accept a model whose training environment has wrappers that may change observations or actions.
 
-    Raises ``InvalidInput`` for an unknown kind of policy, and if observations or actions would differ from those of its
-    training.
+    Raises ``InvalidInput`` for an unknown kind of policy, if observations or actions would differ from those of its
+    training, and if a model's discount was too large for the shaping of its reward (``episode.shaping``).
 
     >>> import ethbrake_marl as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
@@ -256,6 +257,7 @@ def policy_agent(
             f"{who}: initial_state = {initial_state!r:.60}: must be a function, number of episodes -> memory, for a"
             " function (observation, state) -> (action, state); write one around another kind of model"
         )
+    check_gamma(policy, who)
     if not ignore_wrappers:
         check_wrappers(policy, who)
         actions = count_of_actions(policy, actions, who)

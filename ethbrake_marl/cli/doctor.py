@@ -37,8 +37,8 @@ _DOORS = (
 
 _IN_PYTHON = """
 import ethbrake_marl as eb
-for given in ({}, {"reward": {"harm": 0.05, "shaping": 0.05}}):  # shaped, as PPO is trained
-    env = eb.parallel_env(agents="learners", **given)
+for reward in ("honest", "shaped"):
+    env = eb.parallel_env(agents="learners", reward=reward)
     env.reset(seed=0)
     env.step({agent: env.action_space(agent).sample() for agent in env.agents})
 """
