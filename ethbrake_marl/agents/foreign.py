@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.errors import InvalidInput, describe_error, naming_extras
 from ethbrake_marl.files.model import first_mistake
@@ -218,8 +219,9 @@ def check_gamma(model: Any, who: str) -> None:
     """Raise ``InvalidInput`` if a model's discount was too large for the reward of its training environment."""
     env, gamma = getattr(model, "get_env", lambda: None)(), getattr(model, "gamma", None)
     for layer in [] if env is None or gamma is None else wrappers_of(env):
-        if type(layer).__module__.startswith("ethbrake_marl.") and hasattr(layer, "game"):
-            layer.game.rewarding.params.check_gamma(gamma, f"{who}: the model was trained with gamma")
+        game = getattr(layer, "game", None)
+        if isinstance(game, Game):
+            game.rewarding.params.check_gamma(gamma, f"{who}: the model was trained with gamma")
 
 
 def wrappers_of(env: Any) -> Iterator[Any]:

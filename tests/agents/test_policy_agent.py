@@ -6,6 +6,7 @@ import copy
 import pickle
 import warnings
 from collections import deque
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -340,6 +341,31 @@ def test_wrappers_that_change_nothing__are_let_through() -> None:
     env = Monitor(wrappers.RecordEpisodeStatistics(wrappers.TimeLimit(env, 50)))
     trained = stable.PPO("MlpPolicy", env, policy_kwargs=dict(TINY))
     assert harms(policy_agent(trained)) == harms(policy_agent(partial(predicted, trained)))
+
+
+UNDER: dict[str, Callable[[Any], Any]] = {
+    "VecEnv": lambda reward: vec_env.VecMonitor(rows(reward=reward)),
+    "Gymnasium": lambda reward: OwnEnv(reward=reward),
+    "PettingZoo": lambda reward: supersuit.concat_vec_envs_v1(
+        supersuit.pettingzoo_env_to_vec_env_v1(EthBrakeParallelEnv(agents="learners", reward=reward)),
+        2,
+        base_class="stable_baselines3",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNDER)
+def test_discount_above_that_of_the_shaping__is_refused(name: str) -> None:
+    def driven(gamma: float, reward: Any) -> Any:
+        env = UNDER[name](reward)
+        model = stable.PPO("MlpPolicy", env, n_steps=4, batch_size=4, gamma=gamma, policy_kwargs=dict(TINY))
+        return policy_agent(model, ignore_wrappers=True)
+
+    early = {"harm": 1.0, "shaping": 0.1, "shaping_discount": 0.95}
+    for gamma, reward in ((1.0, "shaped"), (0.95, early), (1.0, {**early, "shaping": 0.0})):
+        assert driven(gamma, reward).name == "PPO"
+    with refused("agent 'PPO': the model was trained with gamma = 0.99: must be at most 0.95, the reward's shaping_d"):
+        driven(0.99, early)
 
 
 @pytest.mark.parametrize("algorithm", [stable.PPO, stable.SAC])
