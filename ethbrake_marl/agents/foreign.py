@@ -218,9 +218,9 @@ def check_wrappers(policy: Any, who: str) -> None:
 def check_gamma(model: Any, who: str) -> None:
     """Raise ``InvalidInput`` if a model's discount was too large for the reward of its training environment."""
     env, gamma = getattr(model, "get_env", lambda: None)(), getattr(model, "gamma", None)
-    for layer in [] if env is None or gamma is None else wrappers_of(env):
+    for layer in [] if env is None else wrappers_of(env):
         game = getattr(layer, "game", None)
-        if isinstance(game, Game):
+        if gamma is not None and isinstance(game, Game):
             game.rewarding.params.check_gamma(gamma, f"{who}: the model was trained with gamma")
 
 
