@@ -14,8 +14,6 @@ from numbers import Integral
 from pkgutil import resolve_name
 from sysconfig import get_paths
 
-from ethbrake_marl.renamed import new_name
-
 _NAMED = 5  # largest number of failed worlds that a message lists one by one
 
 LINE_LIMIT = 1_500  # characters of a message; a longer message is shortened in the middle
@@ -115,16 +113,15 @@ class CorruptBundle(EthBrakeError, ValueError):
     """A policy bundle (the folder of a trained policy) is damaged, or a folder is no bundle. Nothing was loaded."""
 
 
-_EXTRA_OF = {
+EXTRA_OF = {
     **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
     **dict.fromkeys(("matplotlib", "jinja2", "markupsafe"), "report"),
     **dict.fromkeys(("benchmarl", "torchrl", "tensordict", "hydra"), "marl"),
-    **dict.fromkeys(("onnx", "onnxruntime"), "export"),
+    "onnx": "export",
     **dict.fromkeys(("pandas", "pyarrow"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("ray", "joblib"), "cluster"),
     "optuna": "tune",
-    "numba_cuda": "cuda",
 }
 
 
@@ -145,7 +142,7 @@ def naming_extras() -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        if package not in _EXTRA_OF:
+        if package not in EXTRA_OF:
             raise
         raise _missing(package) from None
 
@@ -157,7 +154,7 @@ def need(package: str) -> None:
 
 
 def _missing(package: str) -> MissingExtra:
-    line = f"{sys.executable} -m pip install 'ethbrake-marl[{_EXTRA_OF[package]}]'"
+    line = f"{sys.executable} -m pip install 'ethbrake-marl[{EXTRA_OF[package]}]'"
     return MissingExtra(f"needs the package {package}, which is not installed; install it with: {line}")
 
 
@@ -216,6 +213,10 @@ class CacheFault(UserWarning):
     """The cache of compiled physics code is damaged, or cannot be written, so code is compiled again."""
 
 
+class NoLocks(UserWarning):
+    """The file system of a folder has no locks, so nothing stops a second process from working in the folder."""
+
+
 class IgnoredName(UserWarning):
     """The key ``name`` in a scenario's file differs from the name of the file, which counts."""
 
@@ -225,8 +226,8 @@ class FreeImpacts(UserWarning):
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Error for an unknown name. Its message says the new name in 2.0, or what else has this name, or suggests similar
-    names, or lists ``known``.
+    """Error for an unknown name. Its message says what else has this name, or suggests similar names, or lists
+    ``known``.
 
     ``kind``: noun such as ``scenario``. ``may_be_own``: a message that lists names also says that a user's own part
     must be registered first.
@@ -234,7 +235,11 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     names, text = sorted({*known}), name if isinstance(name, str) else ""
     longer = [known_name for known_name in names if known_name.startswith(text)]
     close = longer if len(longer) <= _MOST_SUGGESTED and longer else get_close_matches(text, names, n=1)
-    advice = f"; your own {kind} must be registered or installed first (docs/extend.md)" if may_be_own else ""
+    advice = (
+        f"; your own {kind} must be registered first, for instance by --load FILE.py (docs/extend.md)"
+        if may_be_own
+        else ""
+    )
     hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"known: {', '.join(names) or 'none'}{advice}"
     first = re.split("[,:+@]", text)[0]
     tables = {other: resolve_name(place) for other, place in NAMES.items() if kind in NAMES and other != kind}
@@ -243,7 +248,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     others = [other for other, table in tables.items() if first in (table() if callable(table) else table)]
     if others:
         hint = f"{first!r} names another kind: {', '.join(others)}; were two values swapped?"
-    return UnknownName(f"unknown {kind} {name!r}; {new_name(kind, name) or hint}")
+    return UnknownName(f"unknown {kind} {name!r}; {hint}")
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:

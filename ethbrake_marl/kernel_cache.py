@@ -1,7 +1,8 @@
 """Cache of compiled physics code, and notices before the first compilation. Does not import numba.
 
-Each file begins with a digest of its name and data, which is checked before the data are used. A damaged file, or a
-folder that cannot be written, is no error: the program compiles again and warns once.
+Each file begins with a digest of its name and data, which is checked before the data are used. A damaged file, a
+folder that cannot be written, or a file or folder that others can write is no error: the program compiles again and
+warns once.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import stat
 import sys
 import warnings
 from collections.abc import Callable
@@ -19,10 +21,10 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from ethbrake_marl.errors import CacheFault
-from ethbrake_marl.files.store import write_file
+from ethbrake_marl.files.store import new_file
 
 SUFFIX = ".compiled"
-UNSTORED = "every process compiles the physics again; set NUMBA_CACHE_DIR to a folder that can be written"
+UNSTORED = "every process compiles the physics again; set NUMBA_CACHE_DIR to a folder that you alone can write"
 _DIGEST_BYTES = 32
 _warned: list[str] = []
 
@@ -48,7 +50,10 @@ def load_data(name: str, read: Callable[[bytes], Any]) -> Any:
         return None
     content = _read(path, read)
     if content is None:
-        _warn_once(f"{path.parent}: {path.name} is damaged and compiled again; ethbrake doctor checks all files")
+        _warn_once(
+            f"{path.parent}: {path.name} is damaged or can be written by others, and is compiled again; ethbrake doctor"
+            " checks all files"
+        )
         _delete(path)
     return content
 
@@ -58,7 +63,9 @@ def save_data(name: str, data: bytes) -> None:
     try:
         path = _trusted_folder() / f"{name}{SUFFIX}"
         try:
-            write_file(path, _digest(path, data) + data)
+            with new_file(path) as partial:
+                partial.touch(0o644)
+                partial.write_bytes(_digest(path, data) + data)
         except PermissionError:  # Windows cannot replace a file that another process reads
             if _read(path, bytes) is None:
                 raise
@@ -86,7 +93,7 @@ def delete_damaged() -> tuple[int, int]:
 def announce_compilation() -> None:
     """Print a line on stderr, once in this process, just before it first compiles."""
     what = "parts of the physics" if _stored_files() else "the physics for the first time, which takes a minute or more"
-    advice = "" if obstacle() else "; later processes use the stored result (in advance: ethbrake doctor --compile)"
+    advice = "" if obstacle() else "; later processes use the stored result "
     with suppress(AttributeError, OSError, ValueError):  # there is no stderr
         sys.stderr.write(f"compiling {what}{advice}\n")
         sys.stderr.flush()
@@ -100,21 +107,33 @@ def _stored_files() -> list[Path]:
 def _trusted_folder() -> Path:
     """Folder of compiled code, created if it is missing. Raises ``OSError`` if it cannot be used.
 
-    It must belong to this user or root, because machine code from it will be run.
+    Machine code from it will be run, so nobody but this user and root may write to it, or replace it by another folder.
     """
     folder = cache_folder()
     if folder is None:
         raise OSError(0, "HOME and XDG_CACHE_HOME are not set")
-    folder.mkdir(parents=True, exist_ok=True)
-    if hasattr(os, "getuid") and folder.stat().st_uid not in (0, os.getuid()):
-        raise OSError(0, "belongs to another user")
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    real = folder.resolve()
+    for place in dict.fromkeys((folder, *folder.absolute().parents, real, *real.parents)):
+        if _others_can_write(place, may_be_sticky=place not in (folder, real)):
+            raise OSError(0, f"{place} belongs to another user, or others can write to it")
     return folder
 
 
+def _others_can_write(path: Path, *, may_be_sticky: bool = False) -> bool:
+    """Whether another user than root can write a file or folder. In a sticky folder others can only add names."""
+    status = path.stat()
+    is_protected = may_be_sticky and status.st_mode & stat.S_ISVTX
+    owners = {status.st_uid, path.lstat().st_uid}
+    return hasattr(os, "getuid") and (
+        not owners <= {0, os.getuid()} or bool(status.st_mode & 0o022 and not is_protected)
+    )
+
+
 def _read(path: Path, read: Callable[[bytes], Any]) -> Any:
-    """Result of ``read`` for the data in a file; None if the file is damaged."""
+    """Result of ``read`` for the data in a file; None if the file is damaged or others can write it."""
     try:
-        content = path.read_bytes() if path.is_file() else b""
+        content = path.read_bytes() if path.is_file() and not _others_can_write(path) else b""
         data = content[_DIGEST_BYTES:]
         return read(data) if content[:_DIGEST_BYTES] == _digest(path, data) else None
     except Exception:  # of reading, or of `read`: such as a class that is gone

@@ -1,4 +1,8 @@
-"""Runs independent function calls in parallel processes with one thread each, by joblib."""
+"""How many cores a computation uses; and independent function calls in parallel processes, by joblib.
+
+Everything runs on one core unless the caller asks for more: for processes (``jobs``), or for threads in each of them
+(``threads``, or the environment variable ``ETHBRAKE_THREADS``). Both together never use more cores than there are.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +14,47 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import redirect_stdout
 from functools import cache
 from itertools import islice
 from multiprocessing import resource_tracker
 from typing import Any
 
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, check_whole_number, naming_extras
 
+VARIABLE = "ETHBRAKE_THREADS"  # environment variable: number of threads where the caller sets none
+MOST_THREADS = 1024
 WATCH_S = 1.0
 PER_PROCESS = 16  # calls in one batch for a backend that returns the results of a batch all at once
 
 Call = tuple[Callable[..., Any], *tuple[Any, ...]]  # a module-level function and its arguments
 
+PREPARATIONS: dict[str, Call] = {}  # name -> call that a worker process makes before those that it is sent
+_SHARES: dict[int, int] = {}  # process -> cores that it may use, if it is a worker
+
 
 class WorkerLost(EthBrakeError):
     """A worker process was killed during a call."""
+
+
+def usable_cores() -> int:
+    """Number of cores that this process may use: all that its machine offers, or a worker's share of them."""
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return _SHARES.get(os.getpid(), available)
+
+
+def chosen_threads(threads: int | None) -> int:
+    """Number of threads of one computation: ``threads``, or None: the environment variable ``ETHBRAKE_THREADS``, or 1.
+
+    At most ``usable_cores``. Raises ``InvalidInput`` unless the number is a whole number from 1 to 1024.
+    """
+    if threads is None:
+        text = os.environ.get(VARIABLE, "1")
+        if not (text.isascii() and text.isdecimal() and len(text) < 5 and 1 <= int(text) <= MOST_THREADS):
+            raise InvalidInput(f"{VARIABLE} = {text!r:.60}: must be a whole number from 1 to {MOST_THREADS}")
+        threads = int(text)
+    check_whole_number("threads", threads, 1, MOST_THREADS)
+    return min(int(threads), usable_cores())
 
 
 def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
@@ -36,7 +65,8 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
     Args:
         calls: tuples (function, argument, ...) with module-level functions. A generator is read shortly before the
             calls start.
-        jobs: number of calls that run at once; None or 1: one after the other, in this process.
+        jobs: number of calls that run at once, at most ``usable_cores`` on this machine; None or 1: one after the
+            other, in this process.
 
     Raises the error of a call, ``WorkerLost`` if a process is killed, ``InvalidInput`` if a call cannot be pickled, and
     ``MissingExtra`` without joblib.
@@ -54,16 +84,29 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
         from joblib.parallel import get_active_backend
     backend = get_active_backend()[0]
     streams = backend.supports_return_generator
-    one_thread = {"backend": backend, "inner_max_num_threads": 1} if backend.supports_inner_max_num_threads else {}
+    one_thread, share = {}, 1
+    if backend.supports_inner_max_num_threads:  # joblib's own processes on this machine
+        one_thread = {"backend": backend, "inner_max_num_threads": 1}
+        cores = usable_cores()
+        jobs = min(jobs, cores)
+        share = cores // jobs
     with parallel_config(**one_thread):
         parallel = Parallel(jobs, batch_size=1, return_as="generator" if streams else "list")
-    work = (delayed(_answer)(os.getpid(), _pickle_call(call)) for call in calls)
+    first = [_pickle_call(call) for call in PREPARATIONS.values()]
+    work = (delayed(_answer)(os.getpid(), share, first, _pickle_call(call)) for call in calls)
+    is_blocked = streams and hasattr(signal, "pthread_sigmask")
     batches = [work] if streams else iter(lambda: list(islice(work, PER_PROCESS * jobs)), [])
     for batch in batches:
         results: Any = ()
         try:
-            with _blocked_interrupt() if streams else nullcontext():
-                results = parallel(batch)  # a Ctrl-C that was blocked arrives at the end of this clause
+            if is_blocked:  # processes that start inherit the block, until they ignore Ctrl-C
+                resource_tracker.ensure_running()  # it starts with the signal unblocked, and would unblock it here, too
+                signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                results = parallel(batch)
+            finally:
+                if is_blocked:
+                    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             for result in results:  # noqa: UP028  # `yield from` would close `results` outside the clause below
                 yield result
         except BrokenProcessPool:
@@ -71,41 +114,8 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
                 "a worker process was killed, perhaps because memory ran out; use fewer processes at once (--jobs)"
             ) from None
         finally:
-            with warnings.catch_warnings(action="ignore"), _silent_joblib():  # warnings about calls that are cancelled
+            with warnings.catch_warnings(action="ignore"):  # warnings about calls that are cancelled
                 getattr(results, "close", list)()
-
-
-@contextmanager
-def _blocked_interrupt() -> Iterator[None]:
-    """Context in which Ctrl-C is blocked, where the operating system allows it.
-
-    Processes that start in the context inherit the block; they end it when they have begun to ignore Ctrl-C.
-    """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    resource_tracker.ensure_running()  # it starts with the signal unblocked, and would unblock it here, too
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def _silent_joblib() -> Iterator[None]:
-    """Context in which an exception in joblib's thread prints nothing: it may fill a queue that is closed."""
-    before = threading.excepthook
-
-    def tell(arguments: threading.ExceptHookArgs) -> None:
-        if arguments.thread is None or arguments.thread.name != "ExecutorManagerThread":
-            before(arguments)
-
-    threading.excepthook = tell
-    try:
-        yield
-    finally:
-        threading.excepthook = before
 
 
 def _pickle_call(call: Call) -> bytes:
@@ -117,13 +127,24 @@ def _pickle_call(call: Call) -> bytes:
         raise InvalidInput(f"this cannot be sent to another process ({error}); use one process (jobs=1)") from error
 
 
-def _answer(caller: int, call: bytes) -> Any:
-    """Result of a pickled call, whose prints go to stderr. A process other than ``caller`` (an id) becomes a worker."""
-    if os.getpid() != caller:
-        _become_worker()
+def _answer(caller: int, share: int, first: list[bytes], call: bytes) -> Any:
+    """Result of a pickled call, whose prints go to stderr.
+
+    A process other than ``caller`` (an id) becomes a worker, which may use ``share`` cores. It makes the calls
+    ``first`` before this one.
+    """
     with redirect_stdout(sys.stderr):
-        function, *arguments = pickle.loads(call)
-        return function(*arguments)
+        if os.getpid() != caller:
+            _become_worker()
+            _SHARES[os.getpid()] = share
+            for preparation in first:
+                _make(preparation)
+        return _make(call)
+
+
+def _make(call: bytes) -> Any:
+    function, *arguments = pickle.loads(call)
+    return function(*arguments)
 
 
 @cache

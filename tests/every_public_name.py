@@ -24,6 +24,35 @@ def make_cautious(argument: str | None, settings: eb.AgentSettings) -> eb.Agent:
     return Cautious()
 
 
+class Icy(eb.Physics):
+    """The exact physics with half of each learner's action."""
+
+    def check(self, scenario: Any) -> None:
+        return None
+
+    def rewarding(self, game: eb.Game) -> Any:
+        return game.rewarding
+
+    def first_decision(self, game: eb.Game, alert: eb.State) -> eb.State:
+        return game._replace(physics=None).first_decision(alert)
+
+    def follow(self, game: eb.Game, state: eb.State, actions: Any) -> tuple[eb.State, eb.Step]:
+        return game._replace(physics=None).follow(state, 0.5 * actions)
+
+
+class Fog(eb.ChannelKey):
+    """A key of ``v2x`` with a layer that changes nothing."""
+
+    name = "fog"
+
+    def layer(self, v2x: Any) -> eb.Layer:
+        return eb.Layer()
+
+
+def shield_of(game: eb.Game) -> eb.Shield | None:
+    return game.shield
+
+
 def unshielded(team: eb.Team, argument: str | None, settings: eb.AgentSettings) -> eb.Team:
     return team._replace(shield=None)
 
@@ -44,6 +73,9 @@ def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str
     eb.register_algorithm("own", recipe, algorithm)
     eb.register_term("smooth", smooth, unit="m/s2")
     eb.register_feature("load", lambda state, body: state.mass_t[:, body - 1], unit="t", scale=10.0, low=0.0, high=6.0)
+    eb.register_feature_group("loads", [], lambda state, bodies, time_step_s: state.mass_t[:, bodies - 1, np.newaxis])
+    eb.register_physics("icy", Icy())
+    eb.register_v2x_key("fog_m", Fog())
     eb.register_preset("deaf", {"preset": "nominal", "lost": 0.5})
     eb.register_objective("front", lambda harm, vehicle: harm.borne[:, 0])
     eb.register_measure("stopped_s", stopped_s, unit="s")
@@ -100,8 +132,7 @@ def measure(folder: Path) -> list[eb.SummaryRow]:
     policies: list[eb.Policy] = [eb.load_policy(folder), eb.load_shipped("ppo")]
     agents = {"full_brake": "full_brake", "learned": eb.LearnedAgent(policies[0]), "ppo": eb.make_agent("ppo")}
     found: eb.Result = eb.evaluate(worlds, agents, scenario=scenario, measures="pushed_mps,pushed_m")
-    _, game = eb.open_game(scenario)
-    record: eb.EpisodeRecord = eb.record_episode(worlds, eb.Team.of({"vehicle_2": Cautious()}, "cautious"), game)
+    record: eb.EpisodeRecord = eb.record_episode(worlds, Cautious(), scenario=scenario)
     assert record.last.harm("first").shape == found["learned"]["first_impact_harm"].shape
     return eb.summarise(found)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.errors import _EXTRA_OF, MissingExtra, naming_extras
+from ethbrake_marl.errors import EXTRA_OF, MissingExtra, naming_extras
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -171,7 +171,7 @@ sys.exit(run_command(["train", "--steps", "1"]))
 
 
 def test_core__runs_where_no_extra_can_be_imported(tmp_path: Path) -> None:
-    program = WITHOUT_EXTRAS.format(absent=sorted(_EXTRA_OF), line=LINE)
+    program = WITHOUT_EXTRAS.format(absent=sorted(EXTRA_OF), line=LINE)
     status, _, err = ended(program, cwd=tmp_path, warnings="default")
     assert status == 2 and err.splitlines()[-1].endswith(LINE), err
     assert list(tmp_path.iterdir()) == []
@@ -183,17 +183,15 @@ def test_naming_extras__leaves_other_missing_modules_alone() -> None:
     assert not isinstance(caught.value, MissingExtra)
 
 
-def test_extras__are_those_of_the_table_and_all_is_their_sum_without_that_of_gpus() -> None:
-    assert {"dev", "docs", "all", *_EXTRA_OF.values()} == set(EXTRAS)
+def test_extras__are_those_of_the_table_and_all_is_their_sum() -> None:
+    assert {"dev", "docs", "all", *EXTRA_OF.values()} == set(EXTRAS)
     distribution = {
         "stable_baselines3": "stable-baselines3",
         "pygame": "pygame-ce",
         "imageio_ffmpeg": "imageio-ffmpeg",
         "hydra": "hydra-core",
-        "numba_cuda": "numba-cuda",
     }
-    for package, extra in _EXTRA_OF.items():
+    for package, extra in EXTRA_OF.items():
         names = [re.split(r"[<>=\[]", line)[0] for line in EXTRAS[extra]]
         assert distribution.get(package, package) in map(str.lower, names)
-    whole = [extra for extra in dict.fromkeys(_EXTRA_OF.values()) if extra != "cuda"]
-    assert EXTRAS["all"] == [f"ethbrake-marl[{','.join(whole)}]"]
+    assert EXTRAS["all"] == [f"ethbrake-marl[{','.join(dict.fromkeys(EXTRA_OF.values()))}]"]

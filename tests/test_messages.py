@@ -86,12 +86,17 @@ def test_whole_number__is_in_its_range_and_no_truth_value(value: object) -> None
         (lambda: eb.make_agent("step"), "'step' names another kind: shield or search"),
         (lambda: eb.evaluate(measures="pushed", episodes=1), "did you mean 'pushed_m' or 'pushed_mps'?"),
         (lambda: eb.load_scenario("level-0-sensor"), "did you mean 'level-0-sensors'?"),
-        (lambda: eb.parallel_env(reward={"comfort": 1.0}), "must be registered or installed first"),
+        (lambda: eb.parallel_env(reward={"comfort": 1.0}), "must be registered first, for instance by --load FILE.py"),
     ],
 )
 def test_unknown_name__of_something_else_or_with_two_neighbours(call: Any, message: str) -> None:
     with pytest.raises(UnknownName, match=re.escape(message)):
         call()
+
+
+def test_make_env__is_called_parallel_env() -> None:
+    with pytest.raises(AttributeError, match="did you mean 'parallel_env'"):
+        eb.make_env  # noqa: B018
 
 
 USERS_FILE = """\

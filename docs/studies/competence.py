@@ -28,7 +28,7 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import make_teams, open_game
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.evaluation.summary_row import OUTSIDE_SHARE
+from ethbrake_marl.evaluation.summary import OUTSIDE_SHARE
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.policies import training_range
 from ethbrake_marl.policies.bundle import load_named_policy, load_shipped, shipped_policies

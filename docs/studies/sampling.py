@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.identity import versions, worlds_sha256
+from ethbrake_marl.evaluation.provenance import versions, worlds_sha256
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style, write_picture
 
 SCENARIO, WORLDS, SEED = "paper-random", 2000, 7

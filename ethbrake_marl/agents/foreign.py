@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterator
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations
-from ethbrake_marl.errors import InvalidInput, describe_error, naming_extras
-from ethbrake_marl.files.model import first_mistake
-from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.policies.training_range import TrainingRange
-
-MOST_ONNX_BYTES = 1 << 31
 
 Ask = Callable[[Any, Observations], Any]  # (policy, observations [n, F]) -> actions
 
@@ -40,13 +31,11 @@ WRAPPED_ATTRIBUTES = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  
 
 
 def ask_of(policy: Any, who: str) -> Ask:
-    """Function ``(policy, observations) -> actions`` that calls a policy of this kind. The policy has no memory.
+    """Function that calls a policy of this kind.
 
-    Raises ``InvalidInput``, with a message that begins with ``who``, for an unknown kind of policy, and for a model
-    whose actions would be random or depend on the rest of the batch.
+    Raises ``InvalidInput``, beginning with ``who``, for an unknown kind, and for a model whose actions would be random
+    or depend on the rest of the batch.
     """
-    if isinstance(policy, bytes) or (hasattr(policy, "run") and hasattr(policy, "get_inputs")):
-        return ask_onnx
     if hasattr(policy, "predict"):
         return ask_model
     torch = sys.modules.get("torch")
@@ -55,9 +44,8 @@ def ask_of(policy: Any, who: str) -> Ask:
         return ask_torch
     if not callable(policy) or isinstance(policy, Policy):
         raise InvalidInput(
-            f"{who}: policy = {policy!r:.80}: must be a function of observations, an object with predict, a torch"
-            " module, an ONNX session or the path of an .onnx file; a policy of this package drives by"
-            " LearnedAgent(policy)"
+            f"{who}: policy = {policy!r:.80}: must be a function of observations, an object with predict or a torch"
+            " module; the policy of a run or bundle drives by LearnedAgent(load_policy(PATH))"
         )
     return ask_function
 
@@ -67,9 +55,9 @@ def ask_function(function: Any, observations: Observations) -> Any:
 
 
 def ask_model(model: Any, observations: Observations) -> Any:
-    """Deterministic actions of an object with ``predict``; the ``VecNormalize`` of its training is applied.
+    """Deterministic actions of an object with ``predict``, under the ``VecNormalize`` of its training.
 
-    Raises ``InvalidInput`` if the model also returns a state.
+    Raises ``InvalidInput`` for a model with a memory.
     """
     statistics = statistics_of(model)
     answer = model.predict(
@@ -95,40 +83,7 @@ def ask_torch(module: Any, observations: Observations) -> Any:
         return answer.float() if getattr(answer, "dtype", None) == torch.bfloat16 else answer  # which numpy lacks
 
 
-def ask_onnx(session: Any, observations: Observations) -> Any:
-    """Actions of an ONNX model: its output ``action``, or else its first output."""
-    session = session_of(session)
-    names = [output.name for output in session.get_outputs()]
-    return session.run(["action" if "action" in names else names[0]], {session.get_inputs()[0].name: observations})[0]
-
-
-def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
-    file = Path(path).expanduser()
-    if file.suffix != ".onnx":
-        raise InvalidInput(
-            f"{who}: policy = {str(path)!r:.120}: must be the path of an .onnx file; the policy of a run or bundle"
-            " drives by LearnedAgent(load_policy(PATH))"
-        )
-    return read_plain(file, MOST_ONNX_BYTES)
-
-
-def session_of(model: Any) -> Any:
-    """ONNX session for the bytes of a file; a session is returned unchanged."""
-    return _open_session(model) if isinstance(model, bytes) else model
-
-
-@lru_cache(16)
-def _open_session(content: bytes) -> Any:
-    with naming_extras():
-        import onnxruntime
-    try:
-        return onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    except Exception as error:
-        raise InvalidInput(f"policy: the file is no ONNX model that can be run: {describe_error(error)}") from error
-
-
 def _refuse_training_mode(module: Any, who: str) -> None:
-    """Raise ``InvalidInput`` if a layer of a torch module is in training mode and this affects its results."""
     for layer in module.modules():
         shares = [getattr(layer, name, None) for name in ("p", "dropout")]
         random = any(isinstance(share, float | int) and share > 0.0 for share in shares)
@@ -139,36 +94,16 @@ def _refuse_training_mode(module: Any, who: str) -> None:
             )
 
 
-def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
+def features_of(policy: Any) -> tuple[str, ...] | None:
     """Names of the features that a model was trained on, or None if it does not record them."""
-    if ask is ask_onnx:
-        feature_list = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
-        return tuple(feature_list.split(",")) if feature_list else None
     return getattr(getattr(policy, "observation_space", None), "features", None)
-
-
-def range_of(policy: Any, ask: Ask, features: int, who: str) -> TrainingRange | None:
-    """Range of training that an ONNX model records, or None.
-
-    Raises ``InvalidInput``, with a message that begins with ``who``, if the range does not fit the F ``features``.
-    """
-    text = session_of(policy).get_modelmeta().custom_metadata_map.get("training_range") if ask is ask_onnx else None
-    if text is None:
-        return None
-    try:
-        training_range = TrainingRange.model_validate_json(text)
-    except ValidationError as error:
-        raise InvalidInput(f"{who}: training_range in the model's metadata: {first_mistake(error)}") from None
-    if len(training_range.low) != features:
-        raise InvalidInput(f"{who}: training_range in the model's metadata must have {features} features")
-    return training_range
 
 
 def count_of_actions(policy: Any, count: int | None, who: str) -> int | None:
     """Number of discrete actions of a policy; None if it returns numbers in [-1, 1].
 
-    ``count``: the number that the user states, or None. Raises ``InvalidInput``, with a message that begins with
-    ``who``, if the policy's action space is neither ``count`` indices nor, without ``count``, a box from -1 to 1.
+    ``count``: as the user states. Raises ``InvalidInput``, beginning with ``who``, for an action space that does not
+    fit.
     """
     space: Any = getattr(policy, "action_space", None)
     if count is None and getattr(space, "evenly_spaced", False):  # of an environment of this package
@@ -193,9 +128,9 @@ def statistics_of(model: Any) -> Any:
 
 
 def check_wrappers(policy: Any, who: str) -> None:
-    """Raise ``InvalidInput`` if a model was trained under a wrapper that may change observations or actions.
+    """Raise ``InvalidInput`` for a model that was trained under a wrapper which may change observations or actions.
 
-    Also raised if a model was trained under ``VecNormalize`` and the statistics of ``VecNormalize`` are missing.
+    Also raised if the statistics of its ``VecNormalize`` are missing.
     """
     env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
     for layer in [] if env is None else wrappers_of(env):
@@ -236,8 +171,8 @@ def wrappers_of(env: Any) -> Iterator[Any]:
 def _was_normalised(model: Any) -> bool:
     """Whether a model was trained on normalised observations.
 
-    The last observation in training is then outside the model's observation space, or the model also stores the
-    original observation. Off-policy algorithms always store it, so it says nothing about them.
+    Then its last observation is outside its observation space, or it also stores the original observation, which
+    off-policy algorithms always do.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,8 +19,6 @@ from ethbrake_marl.agents.foreign import (
     check_wrappers,
     count_of_actions,
     features_of,
-    onnx_file,
-    range_of,
 )
 from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
 from ethbrake_marl.episode.features import GROUPS
@@ -45,21 +41,18 @@ class RangeMemory(NamedTuple):
     outside: Ints  # [n] number of decisions so far outside the range of the policy's training
 
 
-def follow_fallback(
-    agent: LearnedAgent | PolicyAgent, observations: Observations, actions: Floats, state: State, memory: Any, body: int
-) -> tuple[Floats, RangeMemory | None]:
-    """The policy's ``actions`` [n], or the fallback's where ``observations`` [n, F] are outside; the new memory."""
-    training_range = agent.training_range
-    if training_range is None:
-        return actions, memory
-    outside = training_range.is_outside(observations) & ~state.ended
-    if training_range.fallback and outside.any():
-        actions[outside] = agent.observe(View([training_range.fallback]), state.take(outside), body)[:, 0]
-    return actions, None if memory is None else RangeMemory(memory.outside + outside)
+@dataclass(frozen=True, kw_only=True)
+class RangeObserver(Observer):
+    """Base class of agents that count the decisions outside the range of their training in a ``RangeMemory``."""
+
+    def measures(self, last: State, memory: Any, body: int) -> dict[str, Floats]:
+        if not isinstance(memory, RangeMemory):
+            return {}
+        return {"outside": memory.outside / np.maximum(last.steps, 1)}
 
 
 @dataclass(frozen=True)
-class LearnedAgent(Observer):
+class LearnedAgent(RangeObserver):
     """Drives with the deterministic actions of a policy of this package.
 
     >>> import ethbrake_marl as eb
@@ -103,7 +96,14 @@ class LearnedAgent(Observer):
     def act(self, state: State, memory: RangeMemory | None, body: int) -> tuple[Floats, RangeMemory | None]:
         observations = self.observe(self.policy.observation, state, body)
         actions = self.policy(observations)[:, 0].astype(np.float64)
-        actions, memory = follow_fallback(self, observations, actions, state, memory, body)
+        if self.training_range is not None:
+            outside, fallback = (
+                self.training_range.is_outside(observations) & ~state.ended,
+                self.training_range.fallback,
+            )
+            if fallback and outside.any():
+                actions[outside] = self.observe(View([fallback]), state.take(outside), body)[:, 0]
+            memory = None if memory is None else RangeMemory(memory.outside + outside)
         return commands_of(state, body, actions), memory
 
     @property
@@ -115,7 +115,7 @@ class LearnedAgent(Observer):
 
 
 @dataclass(frozen=True)
-class PolicyAgent(Observer):
+class PolicyAgent(RangeObserver):
     """Drives with a policy of another library; made by ``policy_agent``. It can be pickled if the policy can."""
 
     policy: Any
@@ -127,11 +127,9 @@ class PolicyAgent(Observer):
     initial_state: Callable[[int], Any] | None
     clip: bool
     actions: int | None
-    training_range: TrainingRange | None
     knows: str = MESSAGES
 
     def check(self, game: Game, body: int) -> None:
-        """Raise ``InvalidInput`` if the policy may have been trained on other features than those in ``game``."""
         if self.is_assumed and game.views[body] != self.observation:
             raise InvalidInput(
                 f"agent {self.name!r}: nothing says which features the policy observes, and vehicle_{body} of scenario"
@@ -140,19 +138,15 @@ class PolicyAgent(Observer):
             )
 
     def begin(self, alert: State, body: int) -> Any:
-        if self.initial_state is None:
-            return None if self.training_range is None else RangeMemory(np.zeros(alert.n, np.int64))
-        return self._own(self.initial_state(alert.n), alert.n)
+        return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Commands, [n] m/s2, and the policy's new memory.
-
-        Raises ``AgentFailed`` for actions of a wrong shape or outside their range.
+        """Commands, [n] m/s2, and the policy's new memory. Raises ``AgentFailed`` for actions of a wrong shape or
+        range.
         """
         observations = self.observe(self.observation, state, body)
         if self.initial_state is None:
             actions = self._actions(self.ask(self.policy, observations), state, body)
-            actions, memory = follow_fallback(self, observations, actions, state, memory, body)
         else:
             pair = self.policy(observations, self._own(memory, state.n))
             if not isinstance(pair, tuple) or len(pair) != 2:
@@ -175,10 +169,7 @@ class PolicyAgent(Observer):
         return map_arrays(copied, memory)
 
     def _actions(self, answer: Any, state: State, body: int) -> Floats:
-        """Actions in [-1, 1], [n], from the answer of the policy.
-
-        Raises ``AgentFailed`` for a wrong shape or kind of numbers, and without ``clip`` for a number out of range.
-        """
+        """Actions in [-1, 1], [n], from the answer of the policy."""
         action_array, n, last = to_array(answer), state.n, (self.actions or 0) - 1
         kinds, low, high, right = "fiu", -1.0, 1.0, "a number in [-1, 1]"
         if self.actions is not None:
@@ -223,19 +214,19 @@ def policy_agent(
     with a memory is a function ``(observations, state) -> (actions, state)``.
 
     Args:
-        policy: a function, an object with ``predict`` (Stable-Baselines3: deterministic, under its ``VecNormalize``), a
-            torch module (without gradients), an ONNX session or the path of an ``.onnx`` file.
-        name: name in tables; None: name of the function, class or file.
+        policy: a function, an object with ``predict`` (Stable-Baselines3: deterministic, under its ``VecNormalize``),
+            or a torch module (without gradients).
+        name: name in tables; None: name of the function or class.
         scenario: scenario in which the policy was trained.
-        observation: features on which the policy was trained; None: the features named by its observation space or ONNX
-            metadata, or else those of ``scenario``, or else, with a warning, ``[own, front_1, rear_1]``.
+        observation: features on which the policy was trained; None: the features named by its observation space, or
+            else those of ``scenario``, or else, with a warning, ``[own, front_1, rear_1]``.
         initial_state: number of episodes n -> first memory: an array with n rows, or a tuple of such arrays.
         clip: clip actions to [-1, 1], or indices to the valid ones; otherwise they are errors.
         actions: number of discrete actions, evenly spaced from -1 to 1, if the policy returns indices.
         ignore_wrappers: accept a model whose training environment has wrappers that may change observations or actions.
 
-    Raises ``InvalidInput`` for an unknown kind of policy, if observations or actions would differ from those of its
-    training, and if a model's discount was too large for the shaping of its reward (``episode.shaping``).
+    Raises ``InvalidInput`` for an unknown kind of policy, if observations or actions would differ from its training,
+    and if a model's discount was too large for the shaping of its reward (``episode.shaping``).
 
     >>> import ethbrake_marl as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
@@ -243,10 +234,7 @@ def policy_agent(
     'own.speed'
 
     """
-    if isinstance(policy, str | os.PathLike):
-        name = Path(policy).stem if name is None else name
-        policy = onnx_file(policy, f"agent {name!r}")
-    elif name is None:
+    if name is None:
         name = str(getattr(policy, "__name__", type(policy).__name__))
     who = f"agent {name!r}"
     if actions is not None:
@@ -261,7 +249,7 @@ def policy_agent(
     if not ignore_wrappers:
         check_wrappers(policy, who)
         actions = count_of_actions(policy, actions, who)
-    trained_on, trained_in = features_of(policy, ask), None if scenario is None else load_scenario(scenario)
+    trained_on, trained_in = features_of(policy), None if scenario is None else load_scenario(scenario)
     view = _view(observation, trained_on, trained_in, who)
     if trained_in is None and any(feature.partition(".")[0] in GROUPS for feature in view.names):
         raise InvalidInput(
@@ -278,12 +266,10 @@ def policy_agent(
             stacklevel=2,
         )
     time_step_s = math.nan if trained_in is None else trained_in.time_step_s
-    training_range = range_of(policy, ask, len(view.names), who)
-    return PolicyAgent(policy, name, ask, view, is_assumed, time_step_s, initial_state, clip, actions, training_range)
+    return PolicyAgent(policy, name, ask, view, is_assumed, time_step_s, initial_state, clip, actions)
 
 
 def _view(observation: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:
-    """Features that a policy observes: ``observation``, or ``trained_on``, or those of learners in ``trained_in``."""
     if observation is not None:
         view = observation if isinstance(observation, View) else View(observation)
         if trained_on not in (None, view.names):

@@ -10,28 +10,24 @@ import numpy as np
 
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game, Script, Shield
-from ethbrake_marl.episode.layer import MESSAGES, SENSORS
-from ethbrake_marl.episode.script_calls import ask_script, begin_script, guard_scripts
+from ethbrake_marl.episode.layer import KNOWLEDGE, UNSTATED
+from ethbrake_marl.episode.script_calls import UserScript, ask_script, begin_script, guard_scripts, name_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error
 from ethbrake_marl.motion.layout import Floats
 
-# what an agent needs to know, after `episode.layer.SENSORS` and `MESSAGES`
-ESTIMATED = "estimated model"  # also what the scenario says about all worlds: ranges of values, scripts, physics
-STATE = "true state"  # also gaps, speeds, capacities and latencies of all vehicles, whether received or not
-MODEL = "true model"  # also masses, restitution and scripts: everything that an exact simulation needs
-KNOWLEDGE = (SENSORS, MESSAGES, ESTIMATED, STATE, MODEL)
-UNSTATED = "not stated"
-
 NO_BODIES = np.zeros(0, np.int64)
+PREDICTED = "predicted_harm"  # measure: harm of the line that an agent predicts at the alert
 CHUNK = 2_500  # worlds of a list that are driven together, to limit memory
 
 
 class Agent(Script, Protocol):
     """A ``Script`` (``episode.game``) with a name: it sees the whole state and returns commands for one vehicle.
 
-    An optional method ``check(game, body)`` warns, or raises ``InvalidInput``, if the agent should not drive in a game.
+    Optional methods: ``check(game, body)`` warns, or raises ``InvalidInput``, if the agent should not drive in a game.
+    ``measures(last, memory, body)`` returns what evaluations report of the agent after the episodes, from their last
+    states and its last memory: name -> a value as that of a measure (``evaluation.measures``).
 
     >>> import ethbrake_marl as eb
     >>> class Half:
@@ -50,7 +46,10 @@ class Agent(Script, Protocol):
 
     @property
     def knows(self) -> str:
-        """What the agent needs to know, for tables: one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
+        """What the agent needs to know: one of the texts of ``episode.layer.KNOWLEDGE``, or ``UNSTATED``.
+
+        Layers filter what it sees unless it claims more than its vehicle receives.
+        """
 
 
 class Team(NamedTuple):
@@ -81,8 +80,7 @@ class Team(NamedTuple):
     def game(self, game: Game) -> Game:
         """The game with this team's shield.
 
-        Raises ``InvalidInput`` if the team does not drive exactly the learners, if it has a shield but the game has no
-        learners, or if the game has another shield.
+        Raises ``InvalidInput`` if the team does not drive exactly the learners, or if the game has another shield.
         """
         driven, learners = sorted(self.drivers), sorted(game.settings.learners.tolist())
         if driven != learners:
@@ -106,10 +104,7 @@ class Team(NamedTuple):
 
 
 def check_agent(agent: Any, where: str) -> None:
-    """Raise ``InvalidInput`` unless an agent has ``name``, ``knows``, ``begin`` and ``act``.
-
-    The message begins with ``where``.
-    """
+    """Raise ``InvalidInput``, beginning with ``where``, unless an agent has all attributes of ``Agent``."""
     missing = [part for part in ("name", "knows", "begin", "act") if not hasattr(agent, part)]
     if missing:
         raise InvalidInput(
@@ -120,28 +115,27 @@ def check_agent(agent: Any, where: str) -> None:
 
 
 def check_knows(knows: Any, where: str) -> None:
-    """Raise ``InvalidInput`` unless ``knows`` is one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
     if not isinstance(knows, str) or knows not in (*KNOWLEDGE, UNSTATED):
         right = ", ".join(repr(text) for text in KNOWLEDGE)
         raise InvalidInput(f"{where}: knows = {knows!r:.60}: must be one of {right}, or {UNSTATED!r}")
 
 
 def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Iterator[tuple[Step | None, State]]:
-    """Let a team drive the worlds ``alert`` to the end; yield each state with the step that led to it.
+    """Let a team drive the worlds ``alert`` to the end; yield each state with the step that led to it (at first
+    ``None``).
 
-    ``alert``: worlds at the alert. The first pair is ``None`` and the state at the first decision. Without a shield the
-    agents' commands (m/s2) are applied directly; a shield asks its own agents for proposals. ``donate``: each state is
-    overwritten when the next one is computed.
+    Without a shield the agents' commands (m/s2) are applied directly; a shield asks its own agents for proposals.
+    ``donate``: each state is overwritten when the next one is computed.
     """
     if not isinstance(team, Team):
         raise InvalidInput(f"team = {team!r:.60}: must be a Team, for instance Team.of({{'vehicle_2': agent}}, 'mine')")
-    game = team.game(game)
+    game, alert = team.game(game), game.marked(alert)
     if game.shield is None:
-        state, agents, actions = game.reset(alert), game.agents(guard_scripts(team.drivers)), np.zeros((alert.n, 0))
-        memories = {body: begin_script(agent, alert, body) for body, agent in agents.items()}
+        state, drivers, actions = game.reset(alert), guard_scripts(team.drivers), np.zeros((alert.n, 0))
+        memories = {body: begin_script(agent, alert, body) for body, agent in game.agents(drivers).items()}
         state = state._replace(memories={**state.memories, **memories})
         # From the first decision on, the learners' agents decide as scripts do.
-        game = game._replace(scripts={**game.scripts, **agents}, settings=game.settings._replace(learners=NO_BODIES))
+        game = game._replace(scripts={**game.scripts, **drivers}, settings=game.settings._replace(learners=NO_BODIES))
     else:
         state, actions = game.reset(alert), None
     yield None, state
@@ -151,17 +145,38 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
 
 
 def play_to_end(game: Game, alert: State, team: Team) -> State:
-    """Let a team drive worlds from the alert to the end; return the last state."""
+    """Last state of the worlds ``alert`` driven by a team."""
     for _, state in play(game, alert, team, donate=True):
         last = state
     return last
 
 
-def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
-    """Actions that agents propose, [n, L] in the order of ``drivers``, and their new memories.
+def agents_measures(drivers: Mapping[int, Any], last: State, memories: Mapping[int, Any]) -> dict[str, Any]:
+    """What agents report of themselves (their method ``measures``): name -> value, the mean if several report it.
 
-    ``drivers``: vehicle (1: Vehicle 1) -> agent. ``memories``: vehicle -> memory, old and new.
+    ``predicted_harm`` is left out if several predict, because each of them assumes what the others do. Raises
+    ``AgentFailed`` if an agent's method fails.
     """
+    reports: dict[str, list[Any]] = {}
+    for body, driver in drivers.items():
+        agent = driver.script if isinstance(driver, UserScript) else driver
+        if hasattr(agent, "measures"):
+            try:
+                report = dict(agent.measures(last, memories.get(body), body))
+            except Exception as error:
+                problem = f"vehicle_{body}: measures fails: {describe_error(error)}"
+                raise AgentFailed(name_of(agent), None, problem) from error
+            for name, value in report.items():
+                reports.setdefault(name, []).append(value)
+    return {
+        name: values[0] if len(values) == 1 else np.mean(values, axis=0)
+        for name, values in reports.items()
+        if len(values) == 1 or name != PREDICTED
+    }
+
+
+def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
+    """Actions that agents propose, [n, L] in the order of ``drivers`` (vehicle -> agent), and their new memories."""
     actions, after = np.empty((state.n, len(drivers))), dict(memories)
     for column, (body, agent) in enumerate(drivers.items()):
         commands, after[body] = ask_script(agent, state, memories[body], body)

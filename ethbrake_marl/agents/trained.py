@@ -18,11 +18,9 @@ ANY_ALGORITHM = ("policy", "team")  # names that stand for whatever algorithm ha
 def make_trained(argument: str | None, settings: Any) -> Agent | Team:
     """Agent or team for a policy at a path (``settings.policy``), or for a shipped policy if there is no path.
 
-    The path is the folder of a training run or bundle. ``argument``, or else the name before the ``@``, is the
-    algorithm that must have trained the policy; ``policy`` and ``team`` allow any. ``settings`` are
-    ``names.AgentSettings``. A run in which each learner has its own policy gives a team; the folder of one of its
-    policies gives an agent. Raises ``InvalidInput`` for a policy of another algorithm, and the errors of
-    ``load_policy``.
+    ``argument``, or else the name before the ``@``, is the algorithm that must have trained the policy; ``policy`` and
+    ``team`` allow any. A run in which each learner has its own policy gives a team. Raises ``InvalidInput`` for a
+    policy of another algorithm, and the errors of ``load_policy``.
     """
     spec, path = settings.spec, settings.policy
     name = argument or spec.partition("@")[0]
@@ -67,9 +65,4 @@ POLICY = Part(
 TEAM = Part(make_trained, form="team@RUN", about="the learners of a run, each with its policy", knows=MESSAGES)
 UNIVERSAL = _shipped("universal", "any vehicle of any line, honest cost")
 VINE_PAPER = _shipped("vine-paper", "paper-random, first-impact harm: it pushes")
-PPO_OBSTACLE = _shipped("ppo-obstacle", "paper-random-obstacle, first-impact harm")
-ROLLOUT_OBSTACLE = _shipped("rollout-obstacle", "paper-random-obstacle, total harm")
 VINE_PREFERENCE = _shipped("vine-preference", "paper-random-preference")
-VINE_FRONT = _shipped("vine-front", "cooperation-1-front")
-VINE_PAIR = _shipped("vine-pair", "cooperation-3-pair, Vehicles 2 and 3")
-VINE_ALL = _shipped("vine-all", "cooperation-4-all, all vehicles")

@@ -53,7 +53,7 @@ def agent_show(
     with Out(as_json=as_json) as out:
         from ethbrake_marl.agent_names import make_agent
         from ethbrake_marl.agents.policy_agent import LearnedAgent
-        from ethbrake_marl.evaluation.door import evaluate
+        from ethbrake_marl.evaluation.evaluate import evaluate
 
         agent = make_agent(name, scenario=scenario)
         if not isinstance(agent, LearnedAgent):

@@ -8,8 +8,11 @@ import os
 import re
 import signal
 import sys
+import threading
 import warnings
+from _thread import interrupt_main
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from functools import cache
 from typing import Annotated, Any
 
@@ -21,10 +24,9 @@ from typer.main import get_command, get_group
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
-from ethbrake_marl.cli.command import INTERRUPTED, Out, example
+from ethbrake_marl.cli.command import INTERRUPTED, UNWRITTEN, Out, example, refuse
 from ethbrake_marl.errors import EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.registry import DISTRIBUTION, Registry, giver, points
-from ethbrake_marl.renamed import new_name
 
 app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -33,6 +35,7 @@ app = typer.Typer(
     help="Ethical emergency braking: train, shield and evaluate agents. Every command has a --help with an example.",
     epilog=example("run", "evaluate --agents full_brake,e_v2x_bm --episodes 1000"),
 )
+_IGNORED = threading.Event()  # a Ctrl-C has been ignored and is repeated
 _COMPLETE = "_ETHBRAKE_COMPLETE"  # variable with which a shell asks to complete a command line
 _NAMES = "Names that can be used in --set, recipes and scenarios: ethbrake scenario parts"
 for name, command, usage in (
@@ -62,20 +65,31 @@ def _about(
 
 
 def main() -> None:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy starts threads of its own: one core unless asked
     gc.set_threshold(20_000)  # Python's default of 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
     prepare_streams()
+    sys.unraisablehook = repeat_interrupt
     status = run_command(sys.argv[1:])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command has ended
     exec("")  # noqa: S102  # after Ctrl-C inside another `exec`, Python would end without this status
     sys.exit(status)
 
 
+def repeat_interrupt(ignored: sys.UnraisableHookArgs) -> None:
+    """Repeat a Ctrl-C that Python has ignored, because it arrived in a function that LLVM called."""
+    if ignored.exc_type is KeyboardInterrupt:
+        _IGNORED.set()
+        threading.Timer(0.05, interrupt_main).start()  # not now: this function would lose it, too
+    else:
+        sys.__unraisablehook__(ignored)
+
+
 def run_command(arguments: Sequence[str]) -> int:
     """Run the command line ``ethbrake ARGUMENTS``, and return the exit status.
 
-    0: success. 1: the program that reads the output has closed the pipe. 2: wrong usage, invalid input or a file error,
-    explained in one line on stderr. 130: Ctrl-C. A command may choose another status. Every other exception is a bug of
-    this program and is raised.
+    0: success. 1: the program that reads the output has closed the pipe. 2: wrong usage or invalid input. 3: a file or
+    stdout cannot be written. 2 and 3 are explained in one line on stderr. 130: Ctrl-C. A command may choose another
+    status. Every other exception is a bug of this program and is raised.
     """
     try:
         status = _status_of(arguments)
@@ -88,26 +102,24 @@ def run_command(arguments: Sequence[str]) -> int:
         where = context.command_path if context else "ethbrake"
         message = re.sub(r"Value error, |, unable to parse string as an? \w+", "", error.format_message())
         message = message.replace("Input should be", "must be").replace("a valid integer", "a whole number")
-        unknown = re.match(r"No such command '([\w-]+)'", message)
-        if unknown and (renamed := new_name("command", unknown[1])):
-            message = f"{unknown[0]}; {renamed}"
-        return _refuse(f"{message} (see: {where} --help)")
+        return refuse(f"{message} (see: {where} --help)")
     except EthBrakeError as error:
-        return _refuse(str(error))
+        return refuse(str(error))
     except OSError as error:
         abandon_output()
         if isinstance(error, BrokenPipeError):
             return 1
-        return _refuse(f"{error.filename or 'output'!s:.200}: {error.strerror or error}")
+        return refuse(error, UNWRITTEN)
     except MemoryError as error:
-        return _refuse(f"not enough memory{f' ({error})' if str(error) else ''}; use fewer worlds at once")
+        return refuse(f"not enough memory{f' ({error})' if str(error) else ''}; use fewer worlds at once")
     except KeyboardInterrupt:
-        Out().note("interrupted; repeat the command")
-        return INTERRUPTED
+        return _interrupted()
     except Exception:
-        raise
+        if not _IGNORED.is_set():
+            raise
+        return _interrupted()  # LLVM's callers miss what the interrupted function would have done
     except BaseException as error:  # GeneratorExit and similar, which this package never raises
-        return _refuse(f"your own code ended the process: {describe_error(error)}")
+        return refuse(f"your own code ended the process: {describe_error(error)}")
     return status
 
 
@@ -129,9 +141,9 @@ def _status_of(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _refuse(reason: str) -> int:
-    Out().note(f"ethbrake: error: {reason}")
-    return 2
+def _interrupted() -> int:
+    Out().note("interrupted; repeat the command")
+    return INTERRUPTED
 
 
 def prepare_streams() -> None:
@@ -205,7 +217,7 @@ class Installed(TyperCommand):
     def command(self) -> Any:
         command = COMMANDS[self.entry]
         command.name = self.name
-        return with_installed(command, self.entry)
+        return with_load(with_installed(command, self.entry))
 
     def make_context(self, *arguments: Any, **settings: Any) -> Any:
         return self.command().make_context(*arguments, **settings)
@@ -242,4 +254,50 @@ def _build_commands(*registered: object) -> Any:
         group = get_group(typer.Typer(name=name, help="Commands of installed packages.", add_completion=False))
         program.commands[name] = with_installed(group, name)
     program.commands["doctor"] = program.commands.pop("doctor")  # the last one of the help
-    return program
+    return with_load(program)
+
+
+def with_load(command: Any) -> Any:
+    """The command, or each of a group that is not ``Installed``, with the option ``--load FILE.py``."""
+    if hasattr(command, "commands"):
+        for inside in command.commands.values():
+            with_load(inside)
+    elif not isinstance(command, Installed) and LOAD not in command.params:
+        command.params.append(LOAD)
+    return command
+
+
+def _load_files(context: typer.Context, files: list[str] | None) -> None:
+    from ethbrake_marl.files.python_file import load_file
+
+    if not context.resilient_parsing:
+        with redirect_stdout(sys.stderr):
+            for file in files or ():
+                load_file(file)
+
+
+LoadOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--load",
+        metavar="FILE.py",
+        is_eager=True,
+        callback=_load_files,
+        help="Run a Python file that registers components of your own (docs/extend.md). Can be given several times.",
+    ),
+]
+
+
+def _only_load(load: LoadOption = None) -> None:
+    """Signature from which Typer makes the option ``--load`` of every command."""
+
+
+def _option_of(function: Callable[..., Any]) -> Any:
+    command = typer.Typer(add_completion=False)
+    command.command()(function)
+    (option,) = [option for option in get_command(command).params if option.name == "load"]
+    option.expose_value = False
+    return option
+
+
+LOAD = _option_of(_only_load)

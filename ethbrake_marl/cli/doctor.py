@@ -4,44 +4,19 @@ from __future__ import annotations
 
 import os
 import platform
-import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
-from importlib.util import find_spec
 from pathlib import Path
-from time import perf_counter
-from typing import Annotated
 
 import typer
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli.command import JsonOption, Out
+from ethbrake_marl.errors import EXTRA_OF
 from ethbrake_marl.kernel_cache import UNSTORED, cache_folder, delete_damaged, obstacle
-
-EXTRAS = ("train", "report", "marl", "export", "data", "render", "cluster", "tune", "cuda")
-
-_TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=tried=16", "--set=evaluation.worlds=10")
-
-_LINEUP = "ladder,ppo,ppo+episode,full_brake+step"
-
-# Small calls of the usual commands, which compile the kernels that they use. The call with a single world compiles
-# kernels for another memory layout.
-_DOORS = (
-    ("run", "--steps", "128", "--episodes", "20", "--output", "run", *_TINY),
-    ("evaluate", "--agents", _LINEUP, "--episodes", "20"),
-    ("evaluate", "--agents", "full_brake,ppo+episode,full_brake+step", "--episodes", "1"),
-)
-
-_IN_PYTHON = """
-import ethbrake_marl as eb
-for reward in ("honest", "shaped"):
-    env = eb.parallel_env(agents="learners", reward=reward)
-    env.reset(seed=0)
-    env.step({agent: env.action_space(agent).sample() for agent in env.agents})
-"""
+from ethbrake_marl.parallel import VARIABLE, chosen_threads, usable_cores
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -53,19 +28,14 @@ class Check:
     detail: str  # version, folder or error, for the user
 
 
-def diagnose(*, compile_all: bool = False) -> list[Check]:
-    """Results of all checks, in the order in which the user should solve problems.
-
-    ``compile_all``: also compile the numba kernels (``compile_ahead``).
-    """
-    has_torch = find_spec("torch") is not None
+def diagnose() -> list[Check]:
+    """Results of all checks, in the order in which the user should solve problems."""
     return [
         Check("ethbrake_marl", True, f"{__version__} in {_PACKAGE}"),
         Check("python", True, f"{platform.python_version()} at {sys.executable}"),
-        *dict.fromkeys(_dependencies()),  # torch once: two extras install it
+        *_dependencies(),
         _check("processor", _processor),
         _check("kernel cache", _kernel_cache),
-        *([_check("compile", lambda: compile_ahead(training=has_torch))] if compile_all else []),
         _check("scenarios", _scenarios),
         _check("physics", _golden_impact),
         _check("baseline", _golden_baseline),
@@ -80,34 +50,29 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
-    """Check that each required package is installed, in a version that fits; and those of the extras."""
+    """Check that each required package is installed, in a version that fits. Packages of extras may be missing."""
     from packaging.requirements import Requirement
 
-    from ethbrake_marl.faces.rendering import RENDERERS, why_not
-
-    requirements = [Requirement(line) for line in requires("ethbrake-marl") or []]
-    groups = {extra: [r for r in requirements if r.marker and r.marker.evaluate({"extra": extra})] for extra in EXTRAS}
-    for extra, needed in {"": [r for r in requirements if r.marker is None], **groups}.items():
-        for requirement in needed:
-            # The package pygame has a module of the same name, and the last one installed is there.
-            is_checked = requirement.name == "pygame-ce" and "human" in RENDERERS and find_spec("pygame") is not None
-            if is_checked and (reason := why_not("human")):
-                yield Check(requirement.name, False, reason)
-                continue
-            try:
-                installed = version(requirement.name)
-            except PackageNotFoundError:
-                why = f"the extra {extra} installs it" if extra else f"needs {requirement.specifier}"
-                yield Check(requirement.name, bool(extra), f"is not installed; {why}")
-                continue
-            fits = requirement.specifier.contains(installed, prereleases=True)
-            yield Check(requirement.name, fits, installed if fits else f"{installed}; needs {requirement.specifier}")
+    for requirement in map(Requirement, requires("ethbrake-marl") or []):
+        marker = requirement.marker
+        is_optional = marker is not None and any(marker.evaluate({"extra": each}) for each in EXTRA_OF.values())
+        if marker and not is_optional:  # for development, or for another Python
+            continue
+        try:
+            installed = version(requirement.name)
+        except PackageNotFoundError:
+            yield Check(requirement.name, is_optional, f"is not installed; needs {requirement.specifier}")
+            continue
+        fits = requirement.specifier.contains(installed, prereleases=True)
+        yield Check(requirement.name, fits, installed if fits else f"{installed}; needs {requirement.specifier}")
 
 
 def _processor() -> tuple[bool, str]:
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = os.environ.get("OMP_NUM_THREADS", "not set")
-    return True, f"{usable} of {os.cpu_count()} cores usable; OMP_NUM_THREADS {threads}; training uses one torch thread"
+    return True, (
+        f"{usable_cores()} of {os.cpu_count()} cores usable; {chosen_threads(None)} used unless you ask for more"
+        f" (--jobs, {VARIABLE}); OMP_NUM_THREADS {threads}; training uses one torch thread"
+    )
 
 
 def _kernel_cache() -> tuple[bool, str]:
@@ -160,38 +125,13 @@ def _golden_baseline() -> tuple[bool, str]:
     return computed == expected, f"E-V2X-BM with gaps of 7 m and 7 m: {computed} (known result: {expected})"
 
 
-def compile_ahead(*, training: bool) -> tuple[bool, str]:
-    """Compile and store the numba kernels of the usual commands, by running these commands on a few worlds.
-
-    ``training``: also run ``ethbrake run``, which needs torch. Returns whether all commands succeeded, and a message
-    for the user.
-    """
-    if reason := obstacle():
-        return False, f"{reason}; {UNSTORED}"
-    begun = perf_counter()
-    doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if training or door[0] != "run"]
-    with tempfile.TemporaryDirectory() as folder:
-        failed = [reason for door in [*doors, ("-c", _IN_PYTHON)] if (reason := _call(door, folder))]
-    return not failed, "; ".join(failed) or f"all kernels compiled in {perf_counter() - begun:.0f} s"
-
-
-def _call(arguments: tuple[str, ...], folder: str) -> str:
-    process = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
-    return (process.stderr.strip().splitlines() or [f"status {process.returncode}"])[-1] if process.returncode else ""
-
-
-def doctor_command(
-    compile_all: Annotated[
-        bool, typer.Option("--compile", help="Compile the physics now, so that no later command has to wait for it.")
-    ] = False,
-    as_json: JsonOption = False,
-) -> None:
+def doctor_command(as_json: JsonOption = False) -> None:
     """Check this installation: versions, folders, physics.
 
     Prints one line per check, with OK or FAIL. The exit status is 1 if a check failed.
     """
     with Out(as_json=as_json) as out:
-        checks = diagnose(compile_all=compile_all)
+        checks = diagnose()
         width = max(len(check.name) for check in checks)
         lines = (f"{'OK' if check.ok else 'FAIL':4}  {check.name:{width}}  {check.detail}" for check in checks)
         out.result([asdict(check) for check in checks], *lines)

@@ -23,7 +23,7 @@ from ethbrake_marl.files.store import check_folder
 
 if TYPE_CHECKING:
     from ethbrake_marl.cli.settings import CommandSettings
-    from ethbrake_marl.evaluation.compared import Compared
+    from ethbrake_marl.evaluation.comparison import Comparison
 
 GROUP_EPISODES = 2_000  # worlds of each scenario of a group, except the three tests
 REPORT = "report.html"
@@ -70,6 +70,7 @@ def evaluate_command(
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.evaluation.benchmark import BENCHMARK
         from ethbrake_marl.worlds.catalogue import THREE_TESTS, group_of_scenarios
+        from ethbrake_marl.worlds.physics import departures_by
 
         chosen = read_settings(settings, of_command=("harm_count", "measures"))
         if not isinstance(chosen.command.get("measures", ""), str):
@@ -80,7 +81,7 @@ def evaluate_command(
             raise InvalidInput(
                 f"--report: cannot be used with {scenario}, a group of {len(names)} scenarios; name one scenario"
             )
-        if report and (physics := chosen.change_scenario(scenario).physics) is not None:
+        if report and departures_by(physics := chosen.change_scenario(scenario).physics):
             raise InvalidInput(
                 f"--report: records episodes, which needs exact impacts, and physics: {physics} has none; leave it out"
             )
@@ -92,33 +93,34 @@ def evaluate_command(
             comparisons[name] = _compare(out, name, chosen, agents, count, seed, jobs, is_benchmark=is_benchmark)
         if report and output is not None:
             write = page_function("evaluation", "--report")
-            output.mkdir(parents=True, exist_ok=True)
-            write(output / REPORT, comparisons[scenario], "ethbrake " + " ".join(sys.argv[1:]), force=force)
-            out.note(f"report: {output / REPORT}")
+            with out.writing():
+                output.mkdir(parents=True, exist_ok=True)
+                write(output / REPORT, comparisons[scenario], "ethbrake " + " ".join(sys.argv[1:]), force=force)
+                out.note(f"report: {output / REPORT}")
         _show(out, comparisons, output, per_world, REPORT if report else "", is_benchmark=is_benchmark)
 
 
 def _compare(
     out: Out, scenario: str, chosen: CommandSettings, agents: str, episodes: int, seed: int, jobs: int | None, *,
     is_benchmark: bool,
-) -> Compared:  # fmt: skip
+) -> Comparison:  # fmt: skip
     from ethbrake_marl.agent_names import teams_of
     from ethbrake_marl.evaluation.benchmark import COUNT, benchmark_measures
-    from ethbrake_marl.evaluation.compared import Compared
+    from ethbrake_marl.evaluation.comparison import Comparison
 
     loaded = chosen.change_scenario(scenario)
     harm_count = chosen.command.get("harm_count", COUNT if is_benchmark else "first")
     measures = chosen.command.get("measures", "")
     if is_benchmark:
         measures = ",".join(filter(None, [measures, *benchmark_measures(loaded, episodes=episodes, seed=seed)]))
-    return Compared.of(
+    return Comparison.of(
         loaded, teams_of(agents, loaded, harm_count=harm_count), episodes=episodes, seed=seed, harm_count=harm_count,
         measures=measures, jobs=jobs or 1, on_done=lambda worlds: out.progress("worlds", worlds, episodes),
     )  # fmt: skip
 
 
 def _show(
-    out: Out, comparisons: dict[str, Compared], output: Path | None, per_world: Any, page: str, *, is_benchmark: bool
+    out: Out, comparisons: dict[str, Comparison], output: Path | None, per_world: Any, page: str, *, is_benchmark: bool
 ) -> None:
     """Write the results to the folder ``output``, if there is one, and print them."""
     from ethbrake_marl.evaluation.benchmark import benchmark_rows, benchmark_sheet
@@ -129,8 +131,10 @@ def _show(
 
     tables = {name: comparison.table for name, comparison in comparisons.items()}
     results = {name: comparison.result for name, comparison in comparisons.items()}
-    if output is not None:
-        for name, table in tables.items():
+    for name, table in tables.items():
+        if output is None:
+            break
+        with out.writing():
             place = output / name if len(tables) > 1 else output
             place.mkdir(parents=True, exist_ok=True)
             for file in {*FILES} - {page}:
@@ -140,8 +144,9 @@ def _show(
     if is_benchmark:
         rows, sheet = benchmark_rows(tables), benchmark_sheet(tables)
         if output is not None:
-            write_output(output / ROWS, csv_text(rows).encode(), force=out.force)
-            out.note(f"rows: {output / ROWS}")
+            with out.writing():
+                write_output(output / ROWS, csv_text(rows).encode(), force=out.force)
+                out.note(f"rows: {output / ROWS}")
     elif len(tables) > 1:
         sheet = summarise_lists(tables, results)
         scenarios = (name for name, table in tables.items() for _ in table)

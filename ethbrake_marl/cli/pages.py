@@ -17,7 +17,7 @@ def register_page(shows: str, write: Callable[..., None]) -> None:
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``), ``"worlds"`` (``scenario sample``) or
             ``"run"`` (``ethbrake run``).
-        write: for ``"evaluation"``, a function of the file's path, the results (``evaluation.compared``) and the
+        write: for ``"evaluation"``, a function of the file's path, the results (``evaluation.comparison``) and the
             command; for ``"worlds"``, of the file's path, the scenario, the number of worlds and the seed. For
             ``"run"``, a function that returns a ``training.experiment.ReportWriter``; that class says what it does.
 

@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.text import Text
 
-from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, ScenarioOption, SettingsOption, StepsOption
+from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SettingsOption, StepsOption
 from ethbrake_marl.cli.pages import PAGES
 from ethbrake_marl.cli.train import (
     AFTER_STOPPED_TRAINING,
     OutputOption,
+    TrainingScenarioOption,
     TrainingSeedOption,
     change_recipe,
     run_folder,
     tell_end,
 )
 
-if TYPE_CHECKING:
-    from ethbrake_marl.training.recipe import TrainingRecipe
-    from ethbrake_marl.worlds.scenario import Scenario
-
 QUICKEST = ("quick", "ppo")  # trains the first of these recipes whose algorithm is installed
 QUICKEST_TEAM = ("cooperation", "cooperation-ppo")  # the same for scenarios with several learners
-TESTS_TOGETHER = "mixture-three-tests"  # what the first recipe trains on, for each of the tests that it contains
 
 
 def experiment_command(
-    scenario: ScenarioOption = "paper-random",
+    scenario: TrainingScenarioOption = None,
     steps: StepsOption = None,
     seed: TrainingSeedOption = None,
     episodes: Annotated[int, typer.Option(help="Number of worlds in the evaluation list.", min=1)] = 10_000,
@@ -50,11 +46,12 @@ def experiment_command(
     """Train a policy, shield it, compare it, and write a report.
 
     Trains a single learner or a team. Writes a run's folder with policies, results, results per world, three figures
-    and report.html. If the scenario is one of the three tests (paper-random, paper-random-brake-only,
-    paper-random-obstacle), the policy is also evaluated on the other two, and the recipe quick trains on all three
-    together (mixture-three-tests). For a team, the report also shows the harm that each vehicle bears, and what each
-    learner adds. All agents minimise the honest cost; with --set rules=paper, first-impact harm, for which pushing is
-    free. Ctrl-C ends the training early and evaluates the policy trained so far; a second Ctrl-C stops at once.
+    and report.html. Without --scenario the recipe's own scenario is used: quick trains on the three tests together
+    (mixture-three-tests). The policy is compared in the scenario, or in the first one of a recipe's mixture; if it is
+    one of the three tests (paper-random, paper-random-brake-only, paper-random-obstacle), also in the other two. For a
+    team, the report also shows the harm that each vehicle bears, and what each learner adds. All agents minimise the
+    honest cost; with --set rules=paper, first-impact harm, for which pushing is free. Ctrl-C ends the training early
+    and evaluates the policy trained so far; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_TRAINING) as out:
         from ethbrake_marl.agent_names import require_learner
@@ -65,7 +62,8 @@ def experiment_command(
 
         plan = load_recipe(recipe or quickest())
         changes = read_settings(settings, [*type(plan).model_fields])
-        chosen = changes.change_scenario(scenario)
+        train_on = changes.change_scenario(scenario or plan.scenario or "paper-random")
+        chosen = train_on.members[0] if scenario is None and train_on.members else train_on
         require_learner(chosen)
         if recipe is None and len(chosen.learners) > 1:
             plan = load_recipe(quickest(several=True))
@@ -84,7 +82,7 @@ def experiment_command(
             plan,
             chosen,
             folder,
-            train_on=training_scenario(plan, chosen),
+            train_on=train_on,
             steps=steps,
             seed=seed,
             episodes=episodes,
@@ -93,6 +91,7 @@ def experiment_command(
             settings=changes.texts,
             report=PAGES["run"]() if "run" in PAGES else None,
             on_progress=out.show_progress,
+            on_unwritten=out.unwritten.append,
         )
         trained = experiment.trained
         objective = trained.training.objective
@@ -107,17 +106,6 @@ def experiment_command(
         out.result(experiment.compared.table.to_json(), Text(headline), *tables, in_file=True)
         out.note(where)
         tell_end(out, trained.status, trained.steps, trained.directory)
-
-
-def training_scenario(recipe: TrainingRecipe, scenario: Scenario) -> Scenario:
-    """The mixture of the three tests if the recipe is the first of ``QUICKEST`` and the scenario is one of them."""
-    from ethbrake_marl.worlds.catalogue import load_scenario
-    from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
-
-    mixture = load_scenario(TESTS_TOGETHER)
-    tests = [member.content(without=DESCRIPTIVE_KEYS) for member in mixture.members]
-    is_test = scenario.content(without=DESCRIPTIVE_KEYS) in tests
-    return mixture if recipe.name == QUICKEST[0] and is_test else scenario
 
 
 def quickest(*, several: bool = False) -> str:

@@ -15,7 +15,7 @@ from ethbrake_marl.cli.pages import page_function
 from ethbrake_marl.files.sheet import Sheet
 
 if TYPE_CHECKING:
-    from ethbrake_marl.evaluation.trial import Trial
+    from ethbrake_marl.cli.trial import Trial
     from ethbrake_marl.worlds.scenario import Scenario
 
 TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # worlds that `scenario sample` draws for a table and for a picture
@@ -64,7 +64,7 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
     learner knows, and whether there is anything to learn: the harm of full braking, of the best constant deceleration,
     and of the best known commands. A mixture of lines is tried line by line.
     """
-    from ethbrake_marl.evaluation.trial import try_scenario
+    from ethbrake_marl.cli.trial import try_scenario
     from ethbrake_marl.worlds.catalogue import load_scenario
 
     with Out(as_json=as_json) as out:
@@ -191,7 +191,7 @@ def scenario_parts(as_json: JsonOption = False) -> None:
     from ethbrake_marl.episode.features import FEATURES, GROUPS, WHOLE_GROUPS
     from ethbrake_marl.episode.objectives import OBJECTIVES
     from ethbrake_marl.episode.terms import BUILT_IN, TERMS
-    from ethbrake_marl.evaluation.named_measures import DEFAULT_MEASURES, MEASURES
+    from ethbrake_marl.evaluation.measure_registry import DEFAULT_MEASURES, MEASURES
     from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
     from ethbrake_marl.worlds.channel import PRESETS
 
@@ -268,11 +268,12 @@ def scenario_sample(
         cells = (("" if value is None else repr(value) for value in row.values()) for row in states)
         lines = [",".join(columns), *map(",".join, cells)]
         if picture_file is not None:
-            page_function("worlds", f"--output {picture_file.name}")(
-                picture_file, chosen, n, seed=seed, force=out.force
-            )
-            out.note(f"picture: {picture_file}")
+            draw_worlds = page_function("worlds", f"--output {picture_file.name}")
+            with out.writing():
+                draw_worlds(picture_file, chosen, n, seed=seed, force=out.force)
+                out.note(f"picture: {picture_file}")
         elif output is not None:
-            out.write(output, "\n".join([*lines, ""]), what="worlds")
+            with out.writing():
+                out.write(output, "\n".join([*lines, ""]), what="worlds")
         if output is None or out.as_json:
             out.result(states, *lines, in_file=output is not None)

@@ -15,7 +15,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 if TYPE_CHECKING:
     from ethbrake_marl.training.recipe import TrainingRecipe
 
-NO_SETTING = {"name", "title", "description", "source"}  # words, which cannot be set
+NO_SETTING = {"name", "title", "description", "source", "scenario"}  # which cannot be set
 
 
 class CommandSettings(NamedTuple):

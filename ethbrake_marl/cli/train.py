@@ -22,6 +22,15 @@ AFTER_STOPPED_TRAINING = (
     " an unfinished training"
 )
 
+TrainingScenarioOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME|PATH",
+        help="Name of a shipped or registered scenario, or path of a YAML file.",
+        show_default="the recipe's, or paper-random",
+    ),
+]
+
 TrainingSeedOption = Annotated[
     int | None, typer.Option(help="Seed of the training run.", show_default="as in the recipe")
 ]
@@ -33,14 +42,7 @@ OutputOption = Annotated[
 
 
 def train_command(
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|PATH",
-            help="Name of a shipped or registered scenario, or path of a YAML file.",
-            show_default="paper-random",
-        ),
-    ] = None,
+    scenario: TrainingScenarioOption = None,
     recipe: Annotated[
         str | None,
         typer.Option(metavar="NAME|PATH", help="Name of a shipped recipe, or path of a YAML file.", show_default="ppo"),
@@ -48,10 +50,6 @@ def train_command(
     settings: SettingsOption = None,
     steps: StepsOption = None,
     seed: TrainingSeedOption = None,
-    device: Annotated[
-        str | None,
-        typer.Option(metavar="cpu|cuda|cuda:N", help="Device that trains the policy.", show_default="as in the recipe"),
-    ] = None,
     output: OutputOption = None,
     resume: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Continue the training run in this folder.")
@@ -83,7 +81,7 @@ def train_command(
         if resume is not None:
             options = {
                 "--scenario": scenario, "--recipe": recipe, "--set": settings, "--steps": steps, "--seed": seed,
-                "--device": device, "--output": output, "--force": force or None,
+                "--output": output, "--force": force or None,
             }  # fmt: skip
             for option in (name for name, value in options.items() if value is not None):
                 raise InvalidInput(
@@ -98,7 +96,7 @@ def train_command(
             raise InvalidInput("--other-versions: has no effect on a new run; use it only with --resume FOLDER")
         plan = load_recipe(recipe or "ppo")
         changes = read_settings(settings, [*type(plan).model_fields])
-        chosen = changes.change_scenario(scenario or "paper-random")
+        chosen = changes.change_scenario(scenario or plan.scenario or "paper-random")
         plan = change_recipe(plan, changes.recipe)
         begun = [Training.of(plan, chosen).who_drives()]
         folder = output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed)
@@ -111,7 +109,7 @@ def train_command(
             out.show_progress(progress)
 
         result = train(
-            plan, chosen, folder, steps=steps, seed=seed, device=device, force=force, on_progress=tell,
+            plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell,
             settings=changes.texts,
         )  # fmt: skip
         show_trained(out, result, scenario)

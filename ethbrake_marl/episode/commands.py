@@ -1,7 +1,7 @@
 """Actions and commands: an action in [-1, 1] becomes a command, and a command an action.
 
 A *command* is an acceleration (m/s2), negative brakes. Action -1 is full braking, 0 is coasting, 1 is full driving; in
-between, a command is the action times the present capacity in its direction (``motion.forces.capacity``). Below each
+between, a command is the action times the capacity in its direction (``motion.forces.capacity``). Below each
 kernel stands a function for arrays with the same bits.
 """
 
@@ -21,10 +21,10 @@ LARGEST_ACTION = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # counts
 
 
 @kernel
-def command_of(car, i, action, time):
+def command_of(car, i, action):
     """Command of body i (m/s2) for an ``action``. An action outside [-1, 1] counts as the nearest end of this range."""
     action = min(max(action, -1.0), 1.0)
-    return action * capacity(car, BRAKING if action < 0.0 else DRIVING, i, time)
+    return action * capacity(car, BRAKING if action < 0.0 else DRIVING, i)
 
 
 def commands_of(state: State, bodies: Any, actions: Floats) -> Floats:
@@ -34,16 +34,16 @@ def commands_of(state: State, bodies: Any, actions: Floats) -> Floats:
 
 
 @kernel
-def write_commands(car, wanted, learners, actions, time):
+def write_commands(car, wanted, learners, actions):
     """Write the commands (m/s2) of one world's ``learners`` [L] to ``wanted`` [N + 1], from their ``actions`` [L]."""
     for j in range(learners.shape[0]):
-        wanted[learners[j]] = command_of(car, learners[j], actions[j], time)
+        wanted[learners[j]] = command_of(car, learners[j], actions[j])
 
 
 @kernel
-def action_of(car, i, command, time):
+def action_of(car, i, command):
     """Action of body i for a ``command`` (m/s2), in [-1, 1]; 0 if the body has no capacity in this direction."""
-    most = capacity(car, BRAKING if command < 0.0 else DRIVING, i, time)
+    most = capacity(car, BRAKING if command < 0.0 else DRIVING, i)
     return min(max(command / most, -1.0), 1.0) if most > 0.0 else 0.0
 
 
@@ -58,7 +58,7 @@ def _capacity_for(state: State, bodies: Any, signs: Floats) -> Floats:
 
     ``signs`` are actions or commands; the result has their shape.
     """
-    braking, driving = (capacities(state.car, row, state.time_s)[:, bodies] for row in (BRAKING, DRIVING))
+    braking, driving = (capacities(state.car, row)[:, bodies] for row in (BRAKING, DRIVING))
     return np.where(signs < 0.0, braking, driving)
 
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.commands import proposal_array
-from ethbrake_marl.episode.layer import Layer, agent_through, observe_through, script_through, see_through
+from ethbrake_marl.episode.departures import departures_of
+from ethbrake_marl.episode.layer import Layer, agent_through, observe_through, see_through
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.script_calls import ask_scripts, begin_script
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import State, mark, require
 from ethbrake_marl.episode.step import Step, StepSettings
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Floats, Ints
 
 
@@ -36,6 +36,9 @@ class Script(Protocol):
 
 class Shield(Protocol):
     """Decides which proposed actions are applied, and which are replaced.
+
+    An optional method ``measures(game, last)`` returns what evaluations report of the shield after the episodes, beside
+    the usual measures: name -> a value as that of a measure (``evaluation.measures``).
 
     >>> import numpy as np
     >>> import ethbrake_marl as eb
@@ -73,6 +76,10 @@ class Shield(Protocol):
 
 class Physics(Protocol):
     """Replaces the exact physics of a game: how vehicles move and collide.
+
+    An optional attribute ``departures`` names how its worlds depart from the plain game (``episode.departures``);
+    without it they depart by the name of the class, and all features that predict the exact physics refuse them. If
+    ``departures`` is empty, the physics claims to move vehicles exactly, and keeps these features.
 
     >>> import numpy as np
     >>> import ethbrake_marl as eb
@@ -131,27 +138,36 @@ class Game(NamedTuple):
     # body -> script that looks at the state; a vehicle that is neither here nor a learner holds its first command
     scripts: Mapping[int, Script] = MappingProxyType({})
     shield: Shield | None = None
-    layers: tuple[Layer, ...] = ()  # what vehicles see goes through them; `with_layers` sets them
+    layers: tuple[Layer, ...] = ()  # what vehicles see goes through them; `with_layers` adds some
     physics: Physics | None = None  # None: exact impacts
 
     def with_layers(self, layers: Sequence[Layer]) -> Game:
-        """Copy of this game, with ``layers`` between the true state and the game's views and scripts.
+        """Copy of this game with further ``layers``, in the order listed, after those that it has already.
 
-        Raises ``InvalidInput`` if the game has layers already, for instance those of its scenario's messages.
+        Each layer sees what the layers before it let through. Observations, scripts and agents see what the last lets
+        through.
         """
-        if self.layers:
-            names = ", ".join(type(layer).__name__ for layer in self.layers)
-            raise InvalidInput(f"game {self.name!r} has layers already ({names}); add another by a key of v2x")
-        layers = tuple(layers)
-        scripts = {body: script_through(layers, script) for body, script in self.scripts.items()}
-        return self._replace(scripts=scripts, layers=layers)
+        return self._replace(layers=(*self.layers, *layers))
+
+    def marked(self, alert: State) -> State:
+        """The worlds ``alert``, marked with the departures of this game's physics (``episode.departures``).
+
+        Raises ``InvalidInput`` for worlds of another physics.
+        """
+        departures = departures_of(self.physics)
+        require(alert, f"scenario {self.name!r}", departures, simulates=True)
+        return mark(alert, departures)
 
     def reset(self, alert: State) -> State:
-        """Episodes at their first decision, from worlds at the alert. Scripts decide at the alert."""
-        decided = alert
+        """Episodes at their first decision, from worlds at the alert. Scripts decide at the alert.
+
+        Raises ``InvalidInput`` for worlds of another physics (``marked``).
+        """
+        decided = alert = self.marked(alert)
         if self.scripts:
-            script_memories = {body: begin_script(script, alert, body) for body, script in self.scripts.items()}
-            decided = ask_scripts(self.scripts, alert._replace(memories={**alert.memories, **script_memories}))
+            scripts = self.agents(self.scripts)
+            script_memories = {body: begin_script(script, alert, body) for body, script in scripts.items()}
+            decided = ask_scripts(scripts, alert._replace(memories={**alert.memories, **script_memories}))
         state = self.first_decision(decided)
         memories = dict(state.memories)
         if self.rewarding.shaping is not None:
@@ -191,13 +207,12 @@ class Game(NamedTuple):
     def first_decision(self, alert: State) -> State:
         """Episodes at their first decision, without the memories of shaping and shield, which ``reset`` adds.
 
-        In ``alert`` the scripts have already decided. Raises ``InvalidInput`` if this game has exact impacts and the
-        worlds have another physics.
+        In ``alert`` the scripts have already decided.
         """
         if self.physics is not None:
-            return self.physics.first_decision(self, alert)
-        check_exact(alert, f"scenario {self.name!r}")
-        state = one_step.first_decision(alert, self.deciders, self.settings)
+            state = self.physics.first_decision(self._replace(layers=()), alert)
+        else:
+            state = one_step.first_decision(alert, self.deciders, self.settings)
         for layer in self.layers:
             state = layer.first_decision(self, alert, state)
         return state
@@ -208,8 +223,12 @@ class Game(NamedTuple):
         The reward contains only the two terms that the compiled step computes: ``harm`` of the line and ``terminal``.
         """
         if self.physics is not None:
-            return self.physics.follow(self, state, actions)
-        after, step = one_step.step(self.settings, self.scripts, state, actions, donate=donate and not self.layers)
+            # the layers follow below; the physics asks the scripts, which see through them
+            plain = self._replace(scripts=self.agents(self.scripts), layers=())
+            after, step = self.physics.follow(plain, state, actions)
+        else:
+            scripts, donate = self.agents(self.scripts), donate and not self.layers
+            after, step = one_step.step(self.settings, scripts, state, actions, donate=donate)
         for layer in self.layers:
             after = layer.after(self, state, after)
         return after, step
@@ -223,9 +242,10 @@ class Game(NamedTuple):
         return state
 
     def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
-        """The agents ``drivers``, body -> agent.
+        """The agents or scripts ``drivers``, body -> agent, behind the layers.
 
-        An agent that relies on sensors or messages sees only what the layers let through to its vehicle.
+        They see what the layers let through to their vehicles. Only an agent that claims more (``layer.UNFILTERED``)
+        sees the true state.
         """
         if not self.layers:
             return drivers

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, pair_amount, weights_of
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacity
@@ -139,11 +139,11 @@ def descend_worlds(inputs, shares, rounds, weights, best, least):
     for k in range(len(least)):
         least[k] = 0.0
         for i in range(wanted.shape[1]):
-            wanted[k, i] = -capacity(car[k], BRAKING, i, time[k])
+            wanted[k, i] = -capacity(car[k], BRAKING, i)
         for turn in range(rounds * len(bodies)):
             b = turn % len(bodies)
             for j in range(len(shares)):
-                trials[0, j, 0] = -capacity(car[k], BRAKING, bodies[b], time[k]) * shares[j]
+                trials[0, j, 0] = -capacity(car[k], BRAKING, bodies[b]) * shares[j]
             best[0], least[k], row = 0, math.inf, slice(k, k + 1)
             world = line[row], car[row], wanted[row], bodies[b : b + 1], trials, time[row], until[row], memory
             choose_worlds(world, weights, best, least[row])
@@ -192,8 +192,8 @@ def kernel_inputs(
     ``wanted``, from ``time`` to ``until`` (s, [n] each). ``line``, ``car`` and ``wanted`` are arrays of a ``State``.
     ``memory`` is working memory: scratch of the physics, one line, and the commands of this line.
     """
-    features = "e_v2x_bm other than pairwise, shields other than episode:pairwise, shaping"
-    check_exact(state, f"a plan of constant commands ({features})")
+    features = "e_v2x_bm other than pairwise, shields other than episode:pairwise"
+    require(state, f"a plan of constant commands ({features})", simulates=True)
     until, bodies = np.full(state.n, until_s, np.float64), np.asarray(bodies, np.int64)
     time, trials = state.time_s.copy(), np.ascontiguousarray(trials)
     return state.line, state.car, wanted, bodies, trials, time, until, memory_for(wanted.shape[1])

@@ -60,7 +60,7 @@ def report(line, car, clock, wanted, bodies, borne, out):
             info[TIME_NOW], info[FORCE_NOW], info[COLLIDED] = time, line[k, FORCE, i], 1.0 if impacts > 0.0 else 0.0
             info[BORNE_FIRST], info[BORNE_TOTAL] = borne[0, i - 1], borne[1, i - 1]
             info[LINE_FIRST], info[LINE_TOTAL] = first, total
-            info[COMMAND], info[ACTION] = command, action_of(car[k], i, command, time)
+            info[COMMAND], info[ACTION] = command, action_of(car[k], i, command)
             info[WORLD], info[LISTED] = FIRST_IN_LIST - number if listed else number, 1.0 if listed else 0.0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +17,15 @@ from ethbrake_marl.motion.layout import Bools, Floats
 if TYPE_CHECKING:
     from ethbrake_marl.episode.game import Game
 
-# `knows` of agents that act on what their vehicle sees (all texts: `agents.team.KNOWLEDGE`)
+# what an agent says that it `knows`
 SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
 MESSAGES = "messages"  # also the messages that the vehicle has received
+ESTIMATED = "estimated model"  # also what the scenario says about all worlds: ranges of values, scripts, physics
+STATE = "true state"  # also gaps, speeds, capacities and latencies of all vehicles, whether received or not
+MODEL = "true model"  # also masses, restitution and scripts: everything that an exact simulation needs
+KNOWLEDGE = (SENSORS, MESSAGES, ESTIMATED, STATE, MODEL)
+UNSTATED = "not stated"
+UNFILTERED = (ESTIMATED, STATE, MODEL)  # only who says so sees the true state; layers filter all other agents
 
 
 class Layer:
@@ -28,9 +35,8 @@ class Layer:
     remembers is in ``State.memories``. Physics, rewards and shields use the true state.
 
     >>> import ethbrake_marl as eb
-    >>> from ethbrake_marl.episode.layer import Layer
     >>> from ethbrake_marl.motion.layout import GAP
-    >>> class Fog(Layer):
+    >>> class Fog(eb.Layer):
     ...     def seen(self, state, body):
     ...         line = state.line.copy()
     ...         line[:, GAP, 1:-1] *= 1.1
@@ -44,7 +50,9 @@ class Layer:
 
     """
 
-    stage = 0  # layers of a lower stage come first: stage 0 changes what is sent or measured, stage 1 what arrives
+    # order of the layers that keys of ``v2x`` add: a lower stage first, and within a stage by the names of their keys;
+    # stage 0 changes what is sent or measured, stage 1 what arrives (``Game.with_layers`` ignores the stage)
+    stage = 0
 
     def first_decision(self, game: Game, alert: State, state: State) -> State:
         """The state at the first decision, with this layer's memory of what has happened since the ``alert``."""
@@ -69,6 +77,10 @@ class Layer:
         """Values that this layer adds to the infos: name -> [n] or [n, N]."""
         return {}
 
+    def measures(self, last: State) -> Mapping[str, Any]:
+        """What evaluations report of this layer after the episodes: name -> a value as that of a measure."""
+        return {}
+
     def observe(
         self, later: tuple[Layer, ...], view: View, state: State, body: int, time_step_s: float
     ) -> Observations:
@@ -76,7 +88,7 @@ class Layer:
         return observe_through(later, view, see_through(self, state, body), body, time_step_s)
 
     def script(self, script: Any) -> Any:
-        """A script that acts like ``script`` on the state that this layer lets through to its vehicle."""
+        """Script that acts like ``script`` on the state that this layer lets through to its vehicle."""
         return LayeredScript(self, script)
 
 
@@ -130,9 +142,9 @@ def script_through(layers: tuple[Layer, ...], script: Any) -> Any:
 
 
 def agent_through(layers: tuple[Layer, ...], agent: Any) -> Any:
-    """``agent`` behind all ``layers``, if it uses only sensors and messages. Any other agent is unchanged."""
+    """``agent`` behind all ``layers``. An agent that claims to know more (``UNFILTERED``) is unchanged."""
     if isinstance(agent, UserScript):
         return UserScript(agent_through(layers, agent.script))
     if isinstance(agent, Observer):
         return replace(agent, layers=layers)
-    return script_through(layers, agent) if getattr(agent, "knows", None) in (SENSORS, MESSAGES) else agent
+    return agent if getattr(agent, "knows", UNSTATED) in UNFILTERED else script_through(layers, agent)

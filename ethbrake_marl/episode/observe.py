@@ -238,9 +238,9 @@ def write_observations(line, car, clock, know, observers, offsets, role, obstacl
         for o in range(len(observers)):
             i = observers[o]
             latency_left = max(c[OWN_LATENCY, i] - time, 0.0)
-            own_stop = full_stop_m(w[SPEED, i], latency_left, capacity(c, BRAKING, i, time))
+            own_stop = full_stop_m(w[SPEED, i], latency_left, capacity(c, BRAKING, i))
             value[OWN_SPEED], value[OWN_ACCELERATION], value[OWN_MASS] = w[SPEED, i], w[FORCE, i], c[MASS, i]
-            value[OWN_BRAKING], value[OWN_DRIVING] = capacity(c, BRAKING, i, time), capacity(c, DRIVING, i, time)
+            value[OWN_BRAKING], value[OWN_DRIVING] = capacity(c, BRAKING, i), capacity(c, DRIVING, i)
             value[OWN_LATENCY_LEFT], value[OWN_RESTITUTION] = latency_left, c[RESTITUTION, i]
             f = N_OWN
             for offset in offsets:
@@ -252,11 +252,11 @@ def write_observations(line, car, clock, know, observers, offsets, role, obstacl
                     for p in range(min(i, j), max(i, j)):
                         gap += w[GAP, p]
                     wait = max(c[OWN_LATENCY, j] - time, 0.0)
-                    stop = full_stop_m(w[SPEED, j], wait, capacity(c, BRAKING, j, time))
+                    stop = full_stop_m(w[SPEED, j], wait, capacity(c, BRAKING, j))
                     room = gap + stop if front else stop - gap
                     near[NEAR_KNOWN], near[NEAR_GAP], near[NEAR_ACCELERATION] = 1.0, gap, w[FORCE, j]
                     near[NEAR_CLOSING_SPEED] = w[SPEED, i] - w[SPEED, j] if front else w[SPEED, j] - w[SPEED, i]
-                    near[NEAR_BRAKING], near[NEAR_MASS] = capacity(c, BRAKING, j, time), c[MASS, j]
+                    near[NEAR_BRAKING], near[NEAR_MASS] = capacity(c, BRAKING, j), c[MASS, j]
                     near[NEAR_LATENCY_LEFT] = wait
                     near[NEAR_HIT] = w[HIT, i - 1 if front else i]
                     near[NEAR_STOPPING_MARGIN] = gap + stop - own_stop if front else gap + own_stop - stop

@@ -10,7 +10,7 @@ import numpy as np
 from ethbrake_marl.episode.commands import write_commands
 from ethbrake_marl.episode.counts import Count, amount_so_far, weights_of
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import ENDED, STEPS, TIME, State
+from ethbrake_marl.episode.state import ENDED, STEPS, State
 from ethbrake_marl.episode.step import advance
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.interval import FAILED
@@ -28,7 +28,7 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, we
         harm = amount_so_far(line[k], weights)
         while clock[k, ENDED] == 0.0 and harm <= most[k]:
             actions = plans[k, min(int(clock[k, STEPS]), plans.shape[1] - 1)]
-            write_commands(car[k], wanted[k], learners, actions, clock[k, TIME])
+            write_commands(car[k], wanted[k], learners, actions)
             outcome, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
             harm = math.inf if outcome == FAILED else amount_so_far(line[k], weights)
         out[k] = harm

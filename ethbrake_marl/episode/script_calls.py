@@ -82,8 +82,8 @@ def ask_script(script: Any, state: State, memory: Any, body: int) -> tuple[Float
     if commands.shape != (state.n,) or commands.dtype.kind not in "fiu":
         right = f"must be numbers of the shape ({state.n},)"
         raise AgentFailed(name_of(script), None, f"vehicle_{body}: its commands are {answer!r:.60}; {right}")
-    low = -capacities(state.car, BRAKING, state.time_s)[:, body]
-    high = capacities(state.car, DRIVING, state.time_s)[:, body]
+    low = -capacities(state.car, BRAKING)[:, body]
+    high = capacities(state.car, DRIVING)[:, body]
     good = (commands >= low) & (commands <= high)
     if not good.all():
         k = int(np.argmin(good))

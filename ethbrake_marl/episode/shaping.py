@@ -13,7 +13,7 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import COUNTED_ROWS
 from ethbrake_marl.episode.hold import descend_worlds, memory_for
-from ethbrake_marl.episode.state import END, ENDED, TIME, State, check_exact
+from ethbrake_marl.episode.state import END, ENDED, TIME, State, require
 from ethbrake_marl.episode.step import StepSettings
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import Floats
@@ -62,7 +62,7 @@ def _shaped(settings: StepSettings, discount: float, before: Floats, state: Stat
 
     ``before`` [n] is the potential before the step.
     """
-    check_exact(state, "the term shaping")
+    require(state, "the term shaping", simulates=True)
     learners, (_, rows, bodies) = settings.learners, state.line.shape
     # With one learner only the least harm counts: full braking comes first, which often does no more harm.
     shares, rounds = (STRONGEST_FIRST, 1) if len(learners) == 1 else (BRAKING_SHARES, 2)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set as AbstractSet
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.episode.counts import Count, amount_so_far, pair_amounts, weights_of
+from ethbrake_marl.episode.departures import MARKS, SHOWN, departing_worlds
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacities
@@ -38,8 +39,6 @@ NUMBER = 5  # number of the world in its list; -1: the caller has made it
 END = 6  # time at which the last step ends (s): the horizon, or earlier after `StepSettings.most_steps`
 FIRST_IN_LIST = -2  # NUMBER of world 0 of an evaluation list that a reset asked for; the next ones are -3, -4, ...
 CLOCK_COLUMNS = 7
-
-PHYSICS_MARK = "physics"  # a memory of this name marks worlds whose impacts are not exact (`State.is_exact`)
 
 
 class State(NamedTuple):
@@ -79,7 +78,8 @@ class State(NamedTuple):
 
         ``merged`` turns a list of arrays, one per state, into one array; by default it concatenates them.
         """
-        state: State = map_arrays(lambda *arrays: merged(arrays), *parts)
+        marks = [name for part in parts for name in part.memories.get(MARKS, ())]
+        state: State = map_arrays(lambda *arrays: merged(arrays), *(mark(part, marks) for part in parts))
         return state
 
     def read_only(self) -> State:
@@ -157,13 +157,13 @@ class State(NamedTuple):
 
     @property
     def braking_capacity_mps2(self) -> Floats:
-        """Largest deceleration now, [n, N] m/s2."""
-        return capacities(self.car, BRAKING, self.time_s)[:, 1:]
+        """Largest deceleration, [n, N] m/s2."""
+        return capacities(self.car, BRAKING)[:, 1:]
 
     @property
     def driving_capacity_mps2(self) -> Floats:
-        """Largest forward acceleration now, [n, N] m/s2."""
-        return capacities(self.car, DRIVING, self.time_s)[:, 1:]
+        """Largest forward acceleration, [n, N] m/s2."""
+        return capacities(self.car, DRIVING)[:, 1:]
 
     @property
     def mass_t(self) -> Floats:
@@ -209,28 +209,44 @@ class State(NamedTuple):
         return out + unshared[:, :-1]
 
     @property
+    def departures(self) -> frozenset[str]:
+        """Names of all departures of these worlds from the plain game (``episode.departures``)."""
+        return frozenset(departing_worlds(self.line, self.car, self.memories.get(MARKS, ())))
+
+    @property
     def is_exact(self) -> bool:
-        """Whether these worlds have exact impacts, not another physics (key ``physics`` of a scenario)."""
-        return PHYSICS_MARK not in self.memories
+        """Whether these worlds move and collide as ``motion`` computes, because nothing marks them as departing."""
+        return MARKS not in self.memories
 
     def _check_count(self, count: Count) -> None:
         if self.is_exact:
             return
         _first_impacts, _all_impacts, *beside_harm = weights_of(count)
         if any(beside_harm):
-            check_exact(self, "the honest cost")
+            require(self, "the honest cost", simulates=True)
 
 
-def check_exact(state: State, what: str) -> None:
-    """Raise ``InvalidInput`` if these worlds have another physics than exact impacts (key ``physics`` of a scenario).
+def mark(state: State, names: Iterable[str]) -> State:
+    """The same worlds, marked with departures that their arrays do not show."""
+    marks = dict.fromkeys([*state.memories.get(MARKS, ()), *names])
+    return state._replace(memories={**state.memories, MARKS: marks}) if marks else state
 
-    ``what`` names the feature that needs exact impacts.
+
+def require(state: State, who: str, allows: AbstractSet[str] = frozenset(), *, simulates: bool = False) -> None:
+    """Raise ``InvalidInput`` if worlds depart from the plain game in a way that a feature does not cover.
+
+    ``who`` names the feature, ``allows`` the departures that it covers. A feature that ``simulates`` whole states with
+    ``motion`` covers all departures that stand in their arrays.
     """
-    if not state.is_exact:
-        raise InvalidInput(
-            f"{what} needs exact impacts, and these worlds have another physics (key physics of their scenario);"
-            " physics=null has exact impacts"
-        )
+    if simulates and MARKS not in state.memories:
+        return
+    marks = state.memories.get(MARKS, {})
+    worlds = departing_worlds(state.line, state.car, marks, allows)
+    names = sorted(worlds.keys() & marks.keys() if simulates else worlds)
+    if names:
+        where = f"world {int(np.argmax(worlds[names[0]]))} departs from the plain game"
+        covered = ", ".join(sorted(allows | SHOWN if simulates else allows)) or "none"
+        raise InvalidInput(f"{who} does not cover {names[0]}, by which {where}; departures that it covers: {covered}")
 
 
 def map_arrays(function: Callable[..., Any], memory: Any, *siblings: Any) -> Any:

@@ -183,7 +183,7 @@ def step_rows(
             reward[k, i] = 0.0
         if clock[k, ENDED] == 1.0:
             continue
-        write_commands(car[k], wanted[k], learners, actions[k], clock[k, TIME])
+        write_commands(car[k], wanted[k], learners, actions[k])
         before = beside_harm(line[k], weights)
         outcome, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
         if outcome == FAILED:

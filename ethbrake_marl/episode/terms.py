@@ -35,7 +35,7 @@ import numpy as np
 from ethbrake_marl.episode.counts import pair_amounts
 from ethbrake_marl.episode.functions import call_function, check_finite_values, description_of
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import TRUNCATED, Step
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
@@ -103,7 +103,7 @@ BUILT_IN = {  # name -> (unit, meaning)
 
 def collision(params: Any, before: State, step: Step, after: State) -> Floats:
     """Term collision (formula: module docstring), [n]; needs exact impacts. ``params`` are ``RewardParams``."""
-    check_exact(before, "the sum of the term collision")
+    require(before, "the sum of the term collision", simulates=True)
     if isinstance(params.k_energy, float):
         return -params.k_energy * step.total_harm
     return -(pair_energies(params, after.vehicles) * (after.line[:, TOTAL] - before.line[:, TOTAL])).sum(axis=1)
@@ -139,7 +139,7 @@ def push(before: State, step: Step, after: State) -> Floats:
 
     Formula: ``motion.push``.
     """
-    check_exact(before, "the term push")
+    require(before, "the term push", simulates=True)
     return 0.0 - (after.line[:, PUSHED] - before.line[:, PUSHED]).sum(axis=1)
 
 
@@ -148,13 +148,13 @@ def drove(before: State, step: Step, after: State) -> Floats:
 
     This speed is the integral of the force where it is positive (``motion.forces.driving``).
     """
-    check_exact(before, "the term drove")
+    require(before, "the term drove", simulates=True)
     return 0.0 - (after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1])
 
 
 def still_moving(before: State, step: Step, after: State) -> Floats:
     """Term still_moving, [n]: -1 if the step ends at the horizon with a vehicle in motion, otherwise 0."""
-    check_exact(before, "the term still_moving")
+    require(before, "the term still_moving", simulates=True)
     return 0.0 - step.out[TRUNCATED] * after.moving
 
 

@@ -1,4 +1,4 @@
-"""Evaluate teams: every team drives every world once, and measures turn episodes into columns.
+"""``eb.evaluate``: every team drives every world once, and measures turn episodes into columns.
 
 The worlds are fixed in advance. Counting the episodes that finish first would favour short ones, often with impacts.
 """
@@ -7,24 +7,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.team import CHUNK, KNOWLEDGE, MODEL, UNSTATED, Team, check_knows, play
+from ethbrake_marl.agent_names import open_game, require_learner, teams_of
+from ethbrake_marl.agents.team import CHUNK, Team, agents_measures, check_knows, play
+from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import KNOWLEDGE, MODEL, UNSTATED
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
-from ethbrake_marl.evaluation.identity import policy_digests, versions, worlds_sha256
+from ethbrake_marl.evaluation.measure_registry import check_measure_name, measures_called
 from ethbrake_marl.evaluation.measures import DEFAULT, Measure, MeasureValues, Watch, measure_columns, naming
+from ethbrake_marl.evaluation.provenance import about_scenario, policy_digests, versions, worlds_sha256
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
 from ethbrake_marl.parallel import run_each
-from ethbrake_marl.worlds.describe import clusters_of, columns_of
+from ethbrake_marl.worlds.describe import LABELS, clusters_of, columns_of
+from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.sampling import DrawnWorlds
 
 Columns = dict[str, MeasureValues]
+
+EPISODES, SEED = 10_000, 7  # the evaluation list
+REPORTED = "What the agent, the shield or a layer reports of itself."  # meaning of its measures
 
 
 @dataclass(frozen=True)
@@ -76,10 +84,7 @@ class Result:
         return team in self.columns
 
     def take(self, rows: Any) -> Result:
-        """Result restricted to some worlds. ``rows``: indices of worlds, or a mask [n].
-
-        Raises ``InvalidInput`` if no world is left.
-        """
+        """Result of some worlds: ``rows`` are indices or a mask [n]. Raises ``InvalidInput`` if no world is left."""
         columns = {
             team: {name: values[rows] for name, values in team_columns.items()}
             for team, team_columns in self.columns.items()
@@ -92,7 +97,7 @@ class Result:
         return replace(self, columns=columns, worlds=worlds, about=about)
 
     def arrays(self) -> Columns:
-        """Table with one row per team and world: column name -> values, [teams * n]. Missing numbers are NaN."""
+        """Table with one row per team and world: column name -> [teams * n]. Missing numbers are NaN."""
         names = list(dict.fromkeys(name for team_columns in self.columns.values() for name in team_columns))
         table: Columns = {"agent": np.repeat([*self.columns], self.n)}
         table |= {name: np.tile(values, len(self.columns)) for name, values in self.worlds.items()}
@@ -110,6 +115,72 @@ class Result:
         return DataFrame(self.arrays())
 
 
+def evaluate(
+    worlds: AnyScenario | DrawnWorlds | State | None = None,
+    agents: Any = "full_brake,e_v2x_bm",
+    *,
+    scenario: AnyScenario | None = None,
+    episodes: int | None = None,
+    seed: int | None = None,
+    harm_count: str = "first",
+    measures: Iterable[str] | str = (),
+    jobs: int = 1,
+    on_done: Callable[[int], None] | None = None,
+) -> Result:
+    """Let agents drive the same worlds, each agent once in every world.
+
+    ``eb.evaluate("paper-random", "full_brake,ppo+step")`` is the shortest form. Results have the same bits for any
+    number of processes.
+
+    Args:
+        worlds: a scenario, from whose evaluation list the worlds are taken (a shipped name, the path or content of a
+            file, or a ``Scenario``); or worlds at the alert, together with ``scenario``.
+        agents: names of agents; or a mapping whose keys name the rows of the result, and whose values are names,
+            agents, or mappings from vehicles to agents: ``{"mine": agent, "both": {"vehicle_2": agent, "vehicle_3":
+            "coast"}}``.
+        scenario: scenario to which ``worlds`` belong, if they are worlds at the alert.
+        episodes: number of worlds from the evaluation list; None: 10,000.
+        seed: seed of the evaluation list; None: 7.
+        harm_count: what optimising agents minimise: ``first``, as in the paper, ``total``, or ``honest``, under which
+            pushing hardly pays (``episode.counts``).
+        measures: names of further measures (``evaluation.measure_registry``).
+        jobs: number of processes.
+        on_done: function that is called with the number of worlds driven so far.
+
+    Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for any other mistake.
+
+    >>> import ethbrake_marl as eb
+    >>> result = eb.evaluate("paper-random", "full_brake", episodes=3)
+    >>> result["full_brake"]["total_harm"].round(2)
+    array([33.79, 77.19,  0.  ])
+
+    """
+    test_worlds = None
+    if isinstance(worlds, DrawnWorlds | State):
+        test_worlds = worlds
+    elif worlds is not None:
+        if scenario is not None:
+            raise InvalidInput("evaluate: scenario: is given twice; leave one of the two out")
+        scenario = worlds
+    if scenario is None:
+        if test_worlds is not None:
+            raise InvalidInput("evaluate: worlds need their scenario, for instance scenario='paper-random'")
+        scenario = "paper-random"
+    if test_worlds is not None and (episodes, seed) != (None, None):
+        raise InvalidInput("evaluate: episodes and seed choose worlds of a list; leave them out if worlds are given")
+    episodes, seed = EPISODES if episodes is None else episodes, SEED if seed is None else seed
+    check_count("evaluate: harm_count", harm_count)
+    loaded, game = open_game(scenario)
+    require_learner(loaded)
+    about = about_scenario(loaded, None if test_worlds is not None else seed)
+    if test_worlds is None:
+        check_whole_number("episodes", episodes, 1)
+        test_worlds = loaded.draw(int(episodes), seed)
+    teams = teams_of(agents, loaded, harm_count=harm_count)
+    about["agent_settings"] = {"harm_count": harm_count}
+    return evaluate_teams(test_worlds, teams, game, measures_called(measures or ()), jobs, about=about, on_done=on_done)
+
+
 def evaluate_teams(
     worlds: DrawnWorlds | State,
     agents: Mapping[str, Team],
@@ -120,29 +191,22 @@ def evaluate_teams(
     about: Mapping[str, Any] | None = None,
     on_done: Callable[[int], None] | None = None,
 ) -> Result:
-    """Let every team drive every world once. Results have the same bits for any number of processes.
-
-    Args:
-        worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State`` (without recordings).
-        agents: name in tables -> team, which controls all learners of the game.
-        game: game of the worlds' scenario.
-        measures: further measures, for instance ``measures_called("pushed_m,pushed_mps")``.
-        jobs: number of processes.
-        about: entries to add to ``Result.about``, usually those of ``identity.about_scenario``.
-        on_done: function that is called with the number of worlds that all teams have driven so far.
+    """Let every team drive every world once. ``about``: further entries of ``Result.about``; the rest as in
+    ``evaluate``.
 
     Raises ``InvalidInput`` for worlds that are not at the alert, for worlds or a team that do not fit the game, for
     measures with the same name, and for bad commands of an agent; ``PhysicsError`` if a check of the physics fails.
-
     """
     if jobs is not None:
         check_whole_number("jobs", jobs, 1)
     draw = worlds if isinstance(worlds, DrawnWorlds) else DrawnWorlds.from_state(worlds)
     _check(draw.worlds, agents, game)
     chosen = (*DEFAULT, *measures)
-    alert, n, of_worlds = draw.worlds, draw.worlds.n, columns_of(draw)
+    n, of_worlds, labels = draw.worlds.n, columns_of(draw), draw.worlds.memories.get(LABELS, {})
+    memories = {name: memory for name, memory in draw.worlds.memories.items() if name != LABELS}
+    alert = game.marked(draw.worlds._replace(memories=memories))
     for measure in chosen:
-        if measure.name in of_worlds:
+        if measure.name in of_worlds or any(name.startswith(f"{measure.name}_") for name in labels):
             raise InvalidInput(f"measure {measure.name!r}: is the name of a column of the worlds; give another name")
     owners: dict[str, Measure] = {}
     for measure in chosen:
@@ -157,20 +221,21 @@ def evaluate_teams(
         (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)
         for first in range(0, n, CHUNK)
     )
-    parts: list[dict[str, Columns]] = []
+    parts: list[dict[str, Driven]] = []
     for part in run_each(calls, jobs):
         parts.append(part)
         if on_done is not None:
             on_done(min(len(parts) * CHUNK, n))
+    reported = dict.fromkeys(name for part in parts for driven in part.values() for name in driven.reported)
     learners = game.settings.learners.tolist()
     columns: Columns = {**of_worlds}
     if (columns["world"] < 0).all():  # the user has made these worlds
         columns["world"] = np.arange(n)
     return Result(
-        {team: _join_columns([part[team] for part in parts]) for team in agents},
+        {team: _join_columns([part[team].columns for part in parts]) for team in agents},
         {**columns, "hidden": hidden_from(alert, game)},
-        chosen,
-        {name: known_by(team) for name, team in agents.items()},
+        (*chosen, *(Measure(name, meaning=REPORTED) for name in reported)),
+        {name: known_by(team, game) for name, team in agents.items()},
         {name: {f"vehicle_{i}": agent.name for i, agent in team.drivers.items()} for name, team in agents.items()},
         {name: policy_digests(team.drivers) for name, team in agents.items()},
         {
@@ -189,14 +254,18 @@ def evaluate_teams(
     )
 
 
-def drive_chunk(
-    alert: State, agents: Mapping[str, Team], game: Game, measures: Sequence[Measure]
-) -> dict[str, Columns]:
+class Driven(NamedTuple):
+    """Columns of a team in some worlds."""
+
+    columns: Columns
+    reported: tuple[str, ...]  # names of the measures that only the team itself knows
+
+
+def drive_chunk(alert: State, agents: Mapping[str, Team], game: Game, measures: Sequence[Measure]) -> dict[str, Driven]:
     return {name: _drive_team(alert, name, team, game, measures) for name, team in agents.items()}
 
 
-def _drive_team(alert: State, name: str, team: Team, game: Game, measures: Sequence[Measure]) -> Columns:
-    """Let a team drive all worlds to the end; return the columns of all measures, name -> [n]."""
+def _drive_team(alert: State, name: str, team: Team, game: Game, measures: Sequence[Measure]) -> Driven:
     full_game, start = team.game(game), alert.read_only()
     watches: list[tuple[Measure, Watch]] = []
     for measure in measures:
@@ -213,21 +282,39 @@ def _drive_team(alert: State, name: str, team: Team, game: Game, measures: Seque
             before = state
     last, watched = before.read_only(), {measure.name: watch for measure, watch in watches}
     columns: Columns = {}
+    reports = _reports_of(team, full_game, last)
     for measure in measures:
         with naming(measure):
             if measure.of is not None:
                 value = measure.of(full_game, start, last)
+            elif measure.watch is None:
+                value = reports.pop(measure.name, None)
             else:
                 value = watched[measure.name].result(last) if measure.name in watched else None
         columns |= measure_columns(measure, value, last)
-    return columns
+    for reported, value in reports.items():
+        if reported in columns or reported in [measure.name for measure in measures]:
+            raise InvalidInput(
+                f"team {name!r}: reports the measure {reported!r}, which is in use; its method measures must give"
+                " another name"
+            )
+        check_measure_name(reported)
+        columns |= measure_columns(Measure(reported), value, last)
+    return Driven(columns, tuple(reports))
+
+
+def _reports_of(team: Team, game: Game, last: State) -> dict[str, Any]:
+    """Measures that layers, and the shield or else the agents of a team, report of themselves, name -> value."""
+    reports: dict[str, Any] = {}
+    for layer in game.layers:
+        reports |= layer.measures(last)
+    if team.shield is None:
+        return reports | agents_measures(team.drivers, last, last.memories)
+    return reports | (team.shield.measures(game, last) if hasattr(team.shield, "measures") else {})
 
 
 def _join_columns(parts: Sequence[Columns]) -> Columns:
-    """Columns of all worlds, name -> [n], from those of consecutive chunks of worlds.
-
-    A column that a chunk lacks is left out.
-    """
+    """Columns of all worlds from those of consecutive chunks; a column that a chunk lacks is left out."""
     return {
         name: np.concatenate([part[name] for part in parts]) for name in parts[0] if all(name in part for part in parts)
     }
@@ -236,8 +323,7 @@ def _join_columns(parts: Sequence[Columns]) -> Columns:
 def hidden_from(alert: State, game: Game) -> Bools:
     """Whether the V2X channel hides something from a learner at its first decision, [n].
 
-    True if the learner lacks a quantity of another vehicle. Also true if another vehicle waits for a message, and so
-    reacts later than the latency that it reports.
+    Also true if another vehicle waits for a message, and so reacts later than the latency that it reports.
     """
     late, hidden = alert.car[:, LATENCY] > alert.car[:, OWN_LATENCY], np.zeros(alert.n, np.bool_)
     for i in game.settings.learners.tolist():
@@ -248,9 +334,11 @@ def hidden_from(alert: State, game: Game) -> Bools:
     return hidden
 
 
-def known_by(team: Team) -> str:
-    """What a team must know, in words such as ``messages + true model``."""
-    return " + ".join(word for word in (*KNOWLEDGE, UNSTATED) if word in _knowledge_of(team).values())
+def known_by(team: Team, game: Game) -> str:
+    """What a team must know, in words such as ``messages + true model``; with ``filtered`` if it does not say."""
+    knowledge = _knowledge_of(team).values()
+    silent = f"{UNSTATED}, filtered" if game.layers else UNSTATED
+    return " + ".join([*(word for word in KNOWLEDGE if word in knowledge), *[silent] * (UNSTATED in knowledge)])
 
 
 def _knowledge_of(team: Team) -> dict[str, str]:

@@ -26,7 +26,10 @@ property of a state                      meaning (``episode.state.State``)
 A ``Watch`` also sees each step (``episode.step.Step``): ``first_impact_harm`` and ``total_harm`` of the line, [n]
 m2/s2; ``reward`` [n, N] and its ``terms``; ``terminated``, ``truncated`` and ``safe_end``, [n].
 
-Every evaluation has the measures in DEFAULT. Costly ones are chosen by name: ``evaluation.named_measures``.
+An agent, a shield or a layer may report measures of its own (``agents.team.Agent``, ``episode.game.Shield``,
+``episode.layer.Layer``): a mapping name -> value, with values of the same form.
+
+Every evaluation has the measures in DEFAULT. Costly ones are chosen by name: ``evaluation.measure_registry``.
 """
 
 from __future__ import annotations
@@ -39,25 +42,28 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
-from ethbrake_marl.motion.layout import FIRST, IMPACTS
+from ethbrake_marl.evaluation.record import POST_M, advance_worlds, simulate_again, with_post
+from ethbrake_marl.motion.layout import FIRST, GAP, IMPACTS, LATENCY, NEXT_TIME, PUSHED, Floats, scratch_for
+from ethbrake_marl.registry import Part
 
 MeasureValues = NDArray[Any]
 MeasureValue = MeasureValues | Mapping[str, MeasureValues] | None
 
 AT_REST, HORIZON = "at_rest", "horizon"  # how an episode ended
+PUSHED_FAR_M = 5.0  # Vehicle 1 counts as pushed far above this distance; a mean above it is an exploit
+HARD_MPS2 = 1.0  # a command above this is hard driving
 
 
 class Watch(Protocol):
     """A measure that is computed from every step of the episodes."""
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Process one step from ``before`` to ``after``. ``step`` is None for the motion from the alert to the first
-        decision.
-        """
+        """Process one step; ``step`` is None for the motion from the alert to the first decision."""
 
     def result(self, last: State) -> MeasureValue:
         """Value of the measure after the episodes, in a form that a measure's function may return."""
@@ -66,8 +72,8 @@ class Watch(Protocol):
 class Statistic(NamedTuple):
     """Statistic of a measure's column, for tables and JSON.
 
-    The kind ``rate`` is the share of worlds in which the column is true, ``worst`` the mean of its largest 5 %,
-    ``difference`` the mean difference from the baseline, ``decrease`` 1 - (mean) / (mean of the baseline).
+    ``rate``: share of worlds in which the column is true. ``worst``: mean of its largest 5 %. ``difference``: mean
+    difference from the baseline. ``decrease``: 1 - (mean) / (mean of the baseline).
     """
 
     key: str  # name in JSON
@@ -85,13 +91,13 @@ class Measure(NamedTuple):
     unit: str = "1"
     statistics: tuple[Statistic, ...] = ()  # of its columns; a column without any gets its mean or rate
     watch: Callable[[Game, State], Watch | None] | None = None  # makes a `Watch` from (game, alert)
+    # without `of` and `watch`: a value that agents, shields or layers report by their own method `measures`
 
 
 def measure_columns(measure: Measure, measurement: MeasureValue, last: State) -> dict[str, MeasureValues]:
-    """Columns of a measure, name -> [n], from the value that the measure returned.
+    """Columns of a measure, name -> [n], from the value that it returned. ``last``: last states of the episodes.
 
-    ``last``: last states of the episodes. Raises ``InvalidInput`` for a wrong shape or type, and for numbers that are
-    not finite.
+    Raises ``InvalidInput`` for a wrong shape or type, and for numbers that are not finite.
     """
     if measurement is None:
         return {}
@@ -115,7 +121,18 @@ def measure_columns(measure: Measure, measurement: MeasureValue, last: State) ->
     return columns
 
 
-# ---- built-in measures
+@contextmanager
+def naming(measure: Measure) -> Iterator[None]:
+    """Turn an exception into an ``InvalidInput`` that names the measure; errors of this package pass."""
+    try:
+        yield
+    except EthBrakeError:
+        raise
+    except Exception as error:
+        raise InvalidInput(f"measure {measure.name!r}: its function fails: {describe_error(error)}") from error
+
+
+# ---- measures of every evaluation
 
 
 def collided(game: Game, alert: State, last: State) -> MeasureValue:
@@ -124,10 +141,7 @@ def collided(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 def harm(count: str, game: Game, alert: State, last: State) -> MeasureValue:
-    """Harm at the end, [n] m2/s2: key ``""`` for the line, ``"1"`` to ``"N"`` for what each vehicle bears.
-
-    None for the honest cost if the physics has no exact impacts.
-    """
+    """Harm at the end, [n] m2/s2: key ``""`` for the line, ``"1"`` to ``"N"`` for what each vehicle bears."""
     if count == "honest" and not last.is_exact:
         return None
     borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}
@@ -152,39 +166,6 @@ def end_s(game: Game, alert: State, last: State) -> MeasureValue:
 def ended(game: Game, alert: State, last: State) -> MeasureValue:
     """How each episode ended. at_rest: all vehicles stand; horizon: a vehicle still moves at the horizon."""
     return np.where(last.moving, HORIZON, AT_REST)
-
-
-def predicted_harm(game: Game, alert: State, last: State) -> MeasureValue:
-    """Harm that an agent or a shield predicted at the alert, in the count of harm that it minimises. Defined if exactly
-    one agent or shield predicts.
-    """
-    memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.settings.learners.tolist())]
-    predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
-    return predictions[0] if len(predictions) == 1 and np.isfinite(predictions[0]).all() else None
-
-
-def replaced(game: Game, alert: State, last: State) -> MeasureValue:
-    """actions: number of actions that the shield replaced; none: whether it replaced no action. A shield that chooses
-    once per episode (Algorithm 1) has only none: whether it chose the policy.
-    """
-    memory: Any = last.memories.get("shield")
-    if hasattr(memory, "chosen"):
-        return {"none": memory.chosen}
-    if hasattr(memory, "replaced"):
-        return {"actions": memory.replaced, "none": memory.replaced == 0}
-    return None
-
-
-def outside(game: Game, alert: State, last: State) -> MeasureValue:
-    """Share of a trained policy's decisions outside the range of what it observed in training; for several learners
-    with such policies, their mean.
-    """
-    shield: Any = last.memories.get("shield")
-    memories: Any = [last.memories.get(body) for body in game.settings.learners.tolist()]
-    if shield is not None:
-        memories = getattr(shield, "agents", [getattr(shield, "agent", None)])
-    outside = [memory.outside for memory in memories if hasattr(memory, "outside")]
-    return np.asarray(np.mean(outside, axis=0) / np.maximum(last.steps, 1)) if outside else None
 
 
 def _built_in(of: Callable[[Game, State, State], MeasureValue], unit: str, *statistics: Statistic) -> Measure:
@@ -227,18 +208,164 @@ DEFAULT = (
     _built_in(hardest_impact_mps, "m/s"),
     _built_in(end_s, "s"),
     _built_in(ended, ""),
-    _built_in(predicted_harm, "m2/s2", Statistic("predicted_harm", "mean", "Predicted harm", "Pre-\ndicted")),
-    _built_in(outside, "1"),
-    _built_in(replaced, "1", Statistic("policy_share", "rate", ending="none")),
+    Measure(
+        "predicted_harm", None,
+        "Harm that an agent predicted at the alert, in the count of harm that it minimises. Defined if exactly one"
+        " agent predicts.", "m2/s2",
+        (Statistic("predicted_harm", "mean", "Predicted harm", "Pre-\ndicted"),),
+    ),
+    Measure(
+        "outside", None,
+        "Share of a trained policy's decisions outside the range of what it observed in training; for several learners"
+        " with such policies, their mean.",
+    ),
+    Measure(
+        "replaced", None,
+        "actions: number of actions that the shield replaced; none: whether it replaced no action. A shield that"
+        " chooses once per episode (Algorithm 1) has only none: whether it chose the policy.", "1",
+        (Statistic("policy_share", "rate", ending="none"),),
+    ),
 )  # fmt: skip
 
 
-@contextmanager
-def naming(measure: Measure) -> Iterator[None]:
-    """Turn an exception in the block into an ``InvalidInput`` that names the measure; errors of this package pass."""
-    try:
-        yield
-    except EthBrakeError:
-        raise
-    except Exception as error:
-        raise InvalidInput(f"measure {measure.name!r}: its function fails: {describe_error(error)}") from error
+# ---- measures that are chosen by name
+
+
+def worst5(game: Game, alert: State, last: State) -> MeasureValue:
+    """Mean of the worst 5 % of the worlds, in each count of harm. In rows per world: the harm or cost of the world."""
+    return {count: last.harm(count) for count in COUNTS if count != "honest" or last.is_exact}
+
+
+WORST5 = Part(
+    worst5,
+    unit="m2/s2",
+    statistics=tuple(
+        Statistic(f"worst5_{count}", "worst", f"Worst 5 %, {name}", f"Worst 5 %\n{count}", count)
+        for count, name in IN_WORDS.items()
+    ),
+)
+
+
+def own_way_m(alert: State, body: int, until_s: float) -> Floats:
+    """Distance that a vehicle travels from the alert to ``until_s`` if no other vehicle touches it, [n] m."""
+    require(alert, "pushed_m", simulates=True)
+    line, wanted = alert.line[:, :, [0, body]], alert.wanted[:, [0, body]]
+    line[:, GAP, 0], line[:, GAP, 1] = POST_M, np.inf
+    end_s = np.full(alert.n, until_s)
+    advance_worlds(line, alert.car[:, :, [0, body]], alert.time_s.copy(), end_s, wanted, scratch_for(2))
+    return POST_M - line[:, GAP, 0]
+
+
+class PushedAway:
+    """Measures how far vehicles end beyond the place that they would reach untouched; negative if thrown back."""
+
+    def __init__(self, bodies: list[int], game: Game, alert: State) -> None:
+        self.own_way_m = {body: own_way_m(alert, body, game.settings.horizon_s) for body in bodies}
+        self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
+
+    def see(self, before: State, step: Step | None, after: State) -> None:
+        line = with_post(before)
+        from_m = line[:, GAP, 0].copy()
+        advance_worlds(line, before.car, before.time_s, after.time_s, after.wanted, scratch_for(line.shape[2]))
+        self.way_m += from_m - line[:, GAP, 0]
+
+    def result(self, last: State) -> MeasureValue:
+        """Excess distance, vehicle number -> [n] m; ``1_far`` [n]: whether Vehicle 1 exceeds ``PUSHED_FAR_M``."""
+        wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
+        metres = {
+            f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - untouched_m
+            for body, untouched_m in self.own_way_m.items()
+        }
+        return {**metres, **({"1_far": metres["1"] > PUSHED_FAR_M} if "1" in metres else {})}
+
+
+def pushed_m(game: Game, alert: State) -> PushedAway | None:
+    """How far a vehicle ends beyond the place where it would stop untouched, because of impacts and pushes. In reality
+    the vehicle brakes for something there, so this is dangerous. Defined for vehicles that neither learn nor observe
+    the state.
+    """
+    bodies = [i for i in range(1, alert.vehicles + 1) if i not in game.settings.learners and i not in game.scripts]
+    return PushedAway(bodies, game, alert) if bodies else None
+
+
+def pushed_mps(game: Game, alert: State, last: State) -> MeasureValue:
+    """Push: closing speed that vehicles build up and contacts absorb, while a contact lasts and in the impacts after a
+    pair's first. Without a number: sum over the line; with the number of a vehicle: push by the vehicle behind it;
+    obstacle: push of Vehicle 1 against the obstacle.
+    """
+    require(last, "pushed_mps", simulates=True)
+    of_pair = last.line[:, PUSHED]
+    behind = {f"{i}": of_pair[:, i] for i in range(1, last.vehicles)}
+    return {"": of_pair.sum(axis=1), **behind, "obstacle": of_pair[:, 0]}
+
+
+def first_impact_s(before: State, after: State) -> Floats:
+    """Time of the line's first impact if it lies between the two states, [n] s.
+
+    Else ``before.time_s`` after an earlier impact, ``after.time_s`` before any. There must be no decision between the
+    two.
+    """
+    until: Floats = np.where(before.collided, before.time_s, after.time_s)
+    for k, scratch in simulate_again(before, after, ~before.collided & after.collided):
+        struck = after.line[k, IMPACTS] > 0.0
+        until[k] = before.time_s[k] + scratch[NEXT_TIME, struck].min()
+    return until
+
+
+def driving_s(before: State, after: State, until_s: Floats) -> Floats:
+    """Time from ``before`` to ``until_s`` [n] with a positive command (of ``after``) in force, [n, N] s."""
+    begun_s = np.maximum(before.car[:, LATENCY, 1:], before.time_s[:, np.newaxis])
+    return np.where(after.commands_mps2 > 0.0, np.maximum(until_s[:, np.newaxis] - begun_s, 0.0), 0.0)
+
+
+class DroveTowards:
+    def __init__(self, game: Game, alert: State) -> None:
+        self.learners, self.time_s = game.settings.learners, np.zeros(alert.n)
+        self.driving_s, self.hard = np.zeros((alert.n, alert.vehicles)), np.zeros(alert.n, np.bool_)
+
+    def see(self, before: State, step: Step | None, after: State) -> None:
+        until_s = first_impact_s(before, after)
+        driving = driving_s(before, after, until_s)
+        hard = (driving > 0.0) & (after.commands_mps2 > HARD_MPS2)
+        self.time_s += until_s - before.time_s
+        self.driving_s += driving
+        self.hard |= hard[:, self.learners - 1].any(axis=1)
+
+    def result(self, last: State) -> MeasureValue:
+        share = self.driving_s / np.where(self.time_s > 0.0, self.time_s, 1.0)[:, np.newaxis]
+        shares = {f"{i + 1}": column for i, column in enumerate(share.T)}
+        return {"": share[:, self.learners - 1].max(axis=1, initial=0.0), **shares, "hard": self.hard}
+
+
+def drove_towards(game: Game, alert: State) -> DroveTowards:
+    """Share of the time before the line's first impact (of the whole episode, if there is none) in which a vehicle has
+    a positive command (drives). With the number of a vehicle: for this vehicle; without: the largest share of a
+    learner; hard: whether a learner drove at more than 1 m/s2.
+    """
+    return DroveTowards(game, alert)
+
+
+def still_moving(game: Game, alert: State, last: State) -> MeasureValue:
+    """Whether some vehicle still moves when the episode ends, which is then at the horizon."""
+    return last.moving
+
+
+FAR = "Share of worlds in which Vehicle 1 is pushed more than 5 m beyond the point where it would stop by itself."
+PUSHED_M = Part(
+    watch=pushed_m, unit="m",
+    statistics=(
+        Statistic("pushed_m_1", "mean", "Vehicle 1 pushed (m)", "Pushed\nm", "1"),
+        Statistic("pushed_far_rate", "rate", "Vehicle 1 pushed > 5 m", "Pushed\n> 5 m", "1_far", FAR),
+    ),
+)  # fmt: skip
+PUSHED_MPS = Part(pushed_mps, unit="m/s", statistics=(Statistic("pushed_mps", "mean", "Push (m/s)", "Push\nm/s"),))
+DROVE_TOWARDS = Part(
+    watch=drove_towards,
+    statistics=(
+        Statistic("drove_towards", "mean", "Drove before the first impact", "Drove\nshare"),
+        Statistic("drove_hard_rate", "rate", "Drove at > 1 m/s2 before the first impact", "Drove\nhard", "hard"),
+    ),
+)  # fmt: skip
+STILL_MOVING = Part(
+    still_moving, unit="", statistics=(Statistic("still_moving_rate", "rate", "Still moving", "Still\nmoving"),)
+)  # fmt: skip

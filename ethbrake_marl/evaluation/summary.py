@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from textwrap import fill
 from typing import Any, Literal
 
@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.counts import COLUMN
-from ethbrake_marl.errors import InvalidInput, naming_extras, unknown_name
+from ethbrake_marl.episode.layer import MODEL, STATE
+from ethbrake_marl.errors import InvalidInput, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation import statistics
-from ethbrake_marl.evaluation.captions import caption, ranges_of
 from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, Measure, MeasureValues, Statistic
-from ethbrake_marl.evaluation.summary_row import EXPLOITS, SEES_THROUGH, SummaryRow
+from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, PUSHED_FAR_M, Measure, MeasureValues, Statistic
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, flat_row, terminal_text
+from ethbrake_marl.worlds.quantities import QUANTITIES
 
 BASELINE = "full_brake"
+SEES_THROUGH, EXPLOITS = "†", "‡"  # marks of teams
+OUTSIDE_SHARE = 0.1  # a policy drives elsewhere if a larger share of its decisions is outside its training's range
+MOVING_SHARE = 0.05  # an exploit if a vehicle still moves at the horizon in a larger share of worlds
 IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
 COMPARE = {"difference": statistics.difference, "decrease": statistics.decrease}
 _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
@@ -27,6 +30,15 @@ _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
 WIDE = 30  # characters of a line about a team in a terminal
 FEW = 3  # teams whose intervals fit beside each other in a terminal
 FIRST_COLUMNS = ("collision_rate", *COLUMN.values())  # columns whose intervals stand below the values
+
+SYMBOLS = {
+    "gaps_m": ("d", "m"), "speeds_mps": ("v", "m/s"), "braking_capacity_mps2": ("braking capacity", "m/s²"),
+    "driving_capacity_mps2": ("driving capacity", "m/s²"), "latency_s": ("τ", "s"), "mass_t": ("m", "t"),
+    "restitution": ("e", ""), "obstacle_gap_m": ("obstacle at", "m"), "friction": ("friction", ""),
+    "brake_rate_mps3": ("brake rate", "m/s³"), "release_rate_mps3": ("release rate", "m/s³"),
+    "harm_weight": ("weight of harm", ""),
+}  # fmt: skip
+STAY = "\u00a0"  # a space at which no line ends
 
 HEADINGS = {
     "Agent": "The agent that controls the vehicle. All other vehicles follow the scripts of the scenario. full_brake is"
@@ -38,6 +50,84 @@ HEADINGS = {
     " they read values that the V2X channel hides in these worlds.",
     "Decrease": "1 − (mean harm) / (mean harm of the baseline in the same worlds). Interval: delta method.",
 }
+
+
+@dataclass(frozen=True)
+class SummaryRow:
+    """Results of one team. ``row["total_harm"]`` is the estimate with this key in JSON, or None if it is not defined.
+
+    >>> import ethbrake_marl as eb
+    >>> (row,) = eb.summarise(eb.evaluate("paper-random", "full_brake", episodes=3))
+    >>> row.agent, row.knows, row.collisions, round(row["total_harm"].value, 2)
+    ('full_brake', 'own sensors', 2, 36.99)
+
+    """
+
+    agent: str
+    knows: str  # what the team has to know
+    estimates: Mapping[str, Estimate | None]
+    collisions: int  # number of worlds with an impact
+    horizon_ends: int  # number of worlds in which a vehicle still moves at the horizon
+    episodes: int  # number of worlds
+    hidden_share: float  # share of worlds in which the V2X channel hides something from a controlled vehicle
+    drivers: Mapping[str, str]  # vehicle -> name of its agent
+    policies: Mapping[str, str]  # vehicle -> SHA-256 of its policy
+
+    def __getitem__(self, key: str) -> Estimate | None:
+        if key not in self.estimates:
+            raise unknown_name("estimate", key, self.estimates)
+        return self.estimates[key]
+
+    @property
+    def sees_through(self) -> bool:
+        """Whether the team is omniscient: it reads values that the V2X channel hides in these worlds."""
+        return self.hidden_share > 0.0 and any(word in self.knows for word in (STATE, MODEL))
+
+    @property
+    def outside(self) -> float:
+        """Share of its policies' decisions outside the range of their training; 0 if unknown."""
+        share = self.estimates.get("outside")
+        return 0.0 if share is None else share.value
+
+    @property
+    def is_outside(self) -> bool:
+        return self.outside > OUTSIDE_SHARE
+
+    @property
+    def exploits(self) -> dict[str, str]:
+        """Conduct that harm does not count, in words: ``pushes`` Vehicle 1 far, ``moving`` at the horizon."""
+        pushed, moving = self.estimates.get("pushed_m_1"), self.horizon_ends / self.episodes
+        words = {}
+        if pushed is not None and pushed.value > PUSHED_FAR_M:
+            words["pushes"] = f"pushes Vehicle 1 by {pushed.value:.1f} m on average"
+        if moving > MOVING_SHARE:
+            words["moving"] = f"runs past the horizon in {100 * moving:.1f} % of worlds"
+        return words
+
+    @property
+    def marked(self) -> str:
+        return f"{self.agent} {EXPLOITS}" if self.exploits else self.agent
+
+    @property
+    def about(self) -> str:
+        """What the team knows, † if it is omniscient, and who drives which vehicle if its agents differ."""
+        mixed = len({*self.drivers.values()}) > 1
+        drivers = [f"{vehicle}: {agent}" for vehicle, agent in self.drivers.items() if mixed]
+        return "; ".join([f"{SEES_THROUGH} " * self.sees_through + self.knows, *drivers])
+
+    def to_json(self) -> dict[str, Any]:
+        """Row as plain data: each estimate with interval, standard error and degrees of freedom; None if unknown."""
+        plain: dict[str, Any] = {
+            "agent": self.agent, "knows": self.knows, "sees_through_channel": self.sees_through,
+            "hidden_share": self.hidden_share, "episodes": self.episodes, "collisions": self.collisions,
+            "horizon_ends": self.horizon_ends, "exploits": list(self.exploits),
+            "drivers": dict(self.drivers),
+        }  # fmt: skip
+        for key, estimate in self.estimates.items():
+            plain |= Estimate.side_by_side({key: estimate})
+            plain[f"{key}_error"] = None if estimate is None else estimate.error
+            plain[f"{key}_freedom"] = None if estimate is None else estimate.freedom
+        return plain | {"policy_sha256": dict(self.policies)}
 
 
 class SummaryTable(list[SummaryRow]):
@@ -76,7 +166,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], rows)
 
     def terminal(self) -> Sheet:
-        """Table for a terminal, with intervals only in the first columns, below their values."""
+        """Table for a terminal; only the first columns have intervals."""
         sheet, agent = self.sheet(), Column("Agent,\nwhat it knows", text=True)
         columns = [
             replace(column, interval="below" if column.name in FIRST_COLUMNS else "hidden")
@@ -90,7 +180,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
 
     def measures(self) -> Sheet | None:
-        """Table of the measures without a column in the main table, a column for each team; None if there are none.
+        """Table of the measures without a column in the main table; None if there are none.
 
         Vehicles whose values are equal under every team share a row.
         """
@@ -112,7 +202,7 @@ class SummaryTable(list[SummaryRow]):
         return [self.terminal(), *filter(None, [self.measures()])]
 
     def notes(self) -> list[str]:
-        """Warnings for a reader: rejected worlds, exploits, policies outside their training, hidden values."""
+        """Warnings: rejected worlds, exploits, policies outside their training, hidden values."""
         notes, rejected = [], self.parameters.get("rejected_draws", 0)
         if rejected:
             draws = rejected + self.parameters["count"]
@@ -142,7 +232,7 @@ class SummaryTable(list[SummaryRow]):
         return notes
 
     def meanings(self) -> dict[str, str]:
-        """Heading of a column -> its meaning; for a measure without a column, name of the measure -> meaning."""
+        """Heading of a column, or name of a measure without one -> meaning."""
         texts = {
             statistic.heading: statistic.meaning or measure.meaning
             for measure, statistic in self.statistics.values()
@@ -162,9 +252,8 @@ class SummaryTable(list[SummaryRow]):
         return [{"kind": "evaluate", **row.to_json(), **identity, "parameters": parameters} for row in self]
 
     def to_pandas(self) -> Any:
-        """``DataFrame`` with one row per team. ``x_low`` and ``x_high`` are the ends of the interval of ``x``.
-
-        Missing numbers are NaN. Raises ``MissingExtra`` without pandas.
+        """``DataFrame`` with one row per team; ``x_low`` and ``x_high`` are the ends of ``x``. ``MissingExtra`` without
+        pandas.
         """
         with naming_extras():
             from pandas import DataFrame
@@ -184,10 +273,9 @@ class SummaryTable(list[SummaryRow]):
 
 
 def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
-    """Table of a result, one row per team.
+    """Table of a result, one row per team, each compared with the ``baseline``, paired by world.
 
-    ``baseline`` is the team with which the others are compared, paired by world. If the default, full braking, is not
-    in the result, there are no comparisons; another missing team raises ``UnknownName``.
+    Without full braking, the default, there are no comparisons; another missing team raises ``UnknownName``.
     """
     if baseline != BASELINE and baseline not in result:
         raise unknown_name("baseline", baseline, result)
@@ -243,7 +331,7 @@ def _sort_position(entry: tuple[str, tuple[str, Measure, Statistic]]) -> int:
 def _estimate(
     statistic: Statistic, values: MeasureValues | None, baseline: MeasureValues | None, clusters: NDArray[Any] | None
 ) -> Estimate | None:
-    """Estimate of a statistic, from a team's column and the baseline's, [n] each; None if one of them is missing."""
+    """Estimate of a statistic from the columns of team and baseline, [n]; None if one of them is missing."""
     if values is None or (statistic.kind in COMPARE and baseline is None):
         return None
     if statistic.kind == "rate":
@@ -259,9 +347,8 @@ def _estimate(
 def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
     """One table for each group of worlds, in alphabetical order.
 
-    ``by`` is ``scenario`` (in a mixture), ``recording``, or a vehicle's type such as ``vehicle_2_type``; ``baseline``
-    as in ``summarise``. Raises ``InvalidInput`` if the worlds have no groups, and ``UnknownName`` if ``by`` is none of
-    these.
+    ``by``: ``scenario`` (in a mixture), ``recording``, a vehicle's type such as ``vehicle_2_type``, or a label
+    (``worlds_from_table``). Raises ``InvalidInput`` without groups, ``UnknownName`` for none of these.
     """
     kinds = {name: column for name, column in result.worlds.items() if column.dtype.kind == "U"}
     if not kinds:
@@ -277,10 +364,7 @@ def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[s
 
 
 def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Result]) -> Sheet:
-    """One table of several evaluations, such as the tests of a standard: a section per evaluation, a row per team.
-
-    A team passes a test if no world has an impact.
-    """
+    """One table of several evaluations, such as the tests of a standard: a section for each. No impact: passed."""
     columns: list[Column | str] = [
         Column("Agent", "agent", text=True), Column("Result", "result"),
         Column("Collisions", "collision_rate", **_PERCENT),
@@ -306,3 +390,41 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
     if elsewhere:
         note += f" More than 10 % of its decisions are outside the range of its training: {', '.join(elsewhere)}."
     return Sheet("", columns, rows, note)
+
+
+def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
+    """Quantities of worlds, key -> value, or ``[smallest, largest]`` if they differ; a list for each vehicle or pair.
+
+    ``worlds``: columns, name -> [n]. A column without any number is left out.
+    """
+    ranges: dict[str, Any] = {}
+    for key, rule in QUANTITIES.items():
+        names = [name for i in range(len(worlds)) if (name := rule.column_of(i)) in worlds] if rule.column else []
+        columns = [worlds[name] for name in dict.fromkeys(names) if not np.isnan(worlds[name]).all()]
+        ends = [[float(np.nanmin(column)), float(np.nanmax(column))] for column in columns]
+        plain = [low if low == high else [low, high] for low, high in ends]
+        if plain:
+            ranges[key] = plain[0] if rule.per == "world" else plain
+    return ranges
+
+
+def caption(parameters: Mapping[str, Any]) -> str:
+    """One line about the worlds, from ``SummaryTable.parameters``."""
+    parts = []
+    for key, (symbol, unit) in SYMBOLS.items():
+        if key in parameters:
+            entries = [parameters[key]] if QUANTITIES[key].per == "world" else parameters[key]
+            texts = [f"{e[0]:.3g}–{e[1]:.3g}" if isinstance(e, list) else f"{e:.4g}" for e in entries]
+            value = texts[0] if len(set(texts)) == 1 else f"({f',{STAY}'.join(texts)})"
+            parts.append(f"{symbol}{STAY}={STAY}{value}{f'{STAY}{unit}' if unit else ''}")
+    seed = "" if parameters.get("seed") is None else f", seed {parameters['seed']}"
+    worlds = f"{count_of(parameters['count'], 'world')}{seed}{by_recording(parameters.get('recordings', 0))}"
+    physics = f" (physics: {parameters['physics']})" if "physics" in parameters else ""
+    return f"{parameters['scenario']}{physics}: {worlds}; {'; '.join(parts)}"
+
+
+def by_recording(recordings: int) -> str:
+    """End of a caption: on how many recordings the 95 % intervals rest; empty for 0."""
+    if recordings == 1:
+        return "; no 95 % intervals: all worlds come from one recording"
+    return f"; 95 % intervals by {recordings:,} recordings" if recordings else ""

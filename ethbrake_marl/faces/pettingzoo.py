@@ -180,8 +180,14 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
                 f"step: actions = {actions!r}: must be a mapping from agent to action, such as {{'vehicle_2': [-1.0]}}"
             )
         for agent in actions:
-            if agent not in self.action_spaces:
-                raise unknown_name("agent", agent, self.possible_agents)
+            if agent in self.action_spaces:
+                continue
+            if agent in self.scenario.vehicle_names:
+                raise InvalidInput(
+                    f"step: {agent} follows the script {self.scenario.roles[agent]}, so it takes no action here; leave"
+                    f" its action out, or make the environment with learners={[*self._learners, agent]}"
+                )
+            raise unknown_name("agent", agent, self.possible_agents)
         columns = []
         for agent in self._learners:
             action = actions.get(agent)

@@ -60,6 +60,11 @@ def shield(
     if isinstance(env, str):
         raise InvalidInput(f"shield: {env!r:.60}: is a name; pass make_agent({env!r:.60}), or add +{mode} to the name")
     is_agent = hasattr(env, "act")
+    if not is_agent and not isinstance(env, Team) and not hasattr(env, "unwrapped"):
+        raise InvalidInput(
+            f"shield: {env!r:.80}: is neither an environment nor an agent or a team; make an agent of a network or"
+            " another policy: eb.shield(eb.policy_agent(policy, scenario=...), scenario=...)"
+        )
     if is_agent == (scenario is None):
         right = "pass scenario=..., in which it drives" if is_agent else "leave out scenario"
         raise InvalidInput(f"shield: {env!r:.80}: {right}")

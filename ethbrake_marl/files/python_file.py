@@ -1,7 +1,7 @@
 """Runs the user's Python files, and records their SHA-256.
 
-A file runs only if the user names it in code or on the command line (``--agents my_file.py:make_agent``), never because
-of a run's folder, a recipe or a scenario.
+A file runs only if the user names it in code or on the command line (``--agents my_file.py:make_agent``, ``--load
+my_file.py``), never because of a run's folder, a recipe or a scenario.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 
 from ethbrake_marl.errors import InvalidInput, describe_error
 from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.parallel import PREPARATIONS
 
 _LIMIT_BYTES = 1 << 20
 
@@ -22,14 +23,20 @@ _RUN: dict[Path, ModuleType] = {}  # module of each Python file that this proces
 _SHA256: dict[Path, str] = {}  # of each Python file, and of the files that they use
 
 
-def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
-    """Object ``name`` that a Python file defines. The file runs once per process.
+def load_file(path: str) -> None:
+    """Run a Python file that registers components, also in every process that ``parallel`` starts from now on."""
+    run_file(path)
+    whole_path = str(Path(path).expanduser().resolve())
+    PREPARATIONS[whole_path] = (run_file, whole_path)
 
-    The code has all rights of the user. ``reads``: another file that the code uses, such as weights; its SHA-256 is
-    recorded, too. Raises ``InvalidInput`` if the Python file is missing, fails, has changed since it ran, or does not
-    define ``name``.
+
+def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
+    """Object ``name`` that a Python file defines (``run_file``).
+
+    ``reads``: another file that the code uses, such as weights; its SHA-256 is recorded, too. Raises ``InvalidInput``
+    also if the file does not define ``name``.
     """
-    module = _run_file(Path(path).expanduser(), f"file {path!r}")
+    module = run_file(path)
     if not hasattr(module, name):
         raise InvalidInput(
             f"file {path!r}: does not define {name!r}; write FILE.py:NAME with a name that the file defines"
@@ -49,8 +56,12 @@ def files_run() -> dict[str, str]:
     return {name: ", ".join(sorted({sha for path, sha in _SHA256.items() if path.name == name})) for name in names}
 
 
-def _run_file(path: Path, what: str) -> ModuleType:
-    """Module of a Python file, which runs unless it has run before. ``what``: name of the file in messages."""
+def run_file(file: str) -> ModuleType:
+    """Module of a Python file. The file runs once per process, and its code has all rights of the user.
+
+    Raises ``InvalidInput`` if the file is missing, fails, or has changed since it ran.
+    """
+    path, what = Path(file).expanduser(), f"file {file!r}"
     if not path.is_file():
         raise InvalidInput(f"{what}: {'is not a plain file' if path.exists() else 'does not exist'}")
     content, path = read_plain(path, _LIMIT_BYTES), path.resolve()

@@ -165,11 +165,7 @@ class Sheet:
         ]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Table for a terminal, with the note below.
-
-        Names in the first column are never broken: a name that does not fit is replaced by a number, which is explained
-        below the table.
-        """
+        """Table for a terminal, with the note below. Texts that do not fit are folded."""
         from rich import box
         from rich.table import Table
         from rich.text import Text
@@ -185,11 +181,11 @@ class Sheet:
             else [column.in_terminal(cell) for column, cell in zip(columns, row, strict=True)]
             for row in self.formatted_rows()
         ]
-        column_count, numbers = self._fitted(options.max_width, [row for row in rows if not isinstance(row, str)])
-        for k, column in enumerate(columns[:column_count]):
+        column_count = self._fitting(options.max_width, [row for row in rows if not isinstance(row, str)])
+        for column in columns[:column_count]:
             heading = Text(plain_text(column.short or column.heading, keep="\n"))
             justify: Literal["left", "right"] = "left" if column.text else "right"
-            table.add_column(heading, justify=justify, overflow="fold", no_wrap=k == 0 or not column.text)
+            table.add_column(heading, justify=justify, overflow="fold", no_wrap=not column.text)
         for row in rows:
             if isinstance(row, str):
                 table.add_section()
@@ -198,18 +194,14 @@ class Sheet:
             cells: list[Text] = []
             for text in row[:column_count]:
                 first, line, rest = text.partition("\n")
-                first = first if cells else numbers.get(first, first)
                 cells.append(Text(plain_text(first)).append(plain_text(line + rest, keep="\n"), style="dim"))
             table.add_row(*cells)
         yield table
-        legend = "\n".join(f"{number} {plain_text(name)}" for name, number in numbers.items())
-        for note in filter(None, (legend, self.note)):
-            yield Text(f"\n{note}", "dim")
+        if self.note:
+            yield Text(f"\n{self.note}", "dim")
 
-    def _fitted(self, width: int, rows: Sequence[Sequence[str]]) -> tuple[int, dict[str, str]]:
-        """Number of columns that fit into ``width`` characters; and a number such as ``[1]`` for each name that does
-        not.
-        """
+    def _fitting(self, width: int, rows: Sequence[Sequence[str]]) -> int:
+        """Number of columns that fit into ``width`` characters, at least ``keep``."""
         columns = self.formats
         texts = [[column.short or column.heading, *(row[k] for row in rows)] for k, column in enumerate(columns)]
         wide = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
@@ -217,11 +209,7 @@ class Sheet:
         column_count, keep = len(columns), self.keep or len(columns)
         while column_count > keep and sum(wide[:column_count]) + self.gap * (column_count - 1) > width:
             column_count -= 1
-        numeric = sum(wide[k] for k in range(1, column_count) if not columns[k].text)
-        room = width - numeric - self.gap * (column_count - 1)
-        names = [text.partition("\n")[0] for text in texts[0][1:]]
-        long = dict.fromkeys(name for name in names if len(name) > room and columns[0].text)
-        return column_count, {name: f"[{number}]" for number, name in enumerate(long, 1)}
+        return column_count
 
     def json(self) -> list[dict[str, Any]]:
         """One mapping per row, column name -> cell, without names of sections. An interval has an entry of its own."""

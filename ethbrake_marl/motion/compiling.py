@@ -24,14 +24,11 @@ from typing import Any, TypeVar
 
 import llvmlite
 import numba
-from numba.core import event
 from numba.core.caching import NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
-from numba.core.compiler_lock import global_compiler_lock
 from numba.core.serialize import dumps
 
-from ethbrake_marl.interrupts import Postponed
 from ethbrake_marl.kernel_cache import announce_compilation, load_data, save_data
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -40,33 +37,6 @@ PACKAGE = Path(__file__).parents[1]
 SOURCES = ("motion", "episode")  # folders with the core's kernels
 _MARK = b"motion.compiling import"  # in every other file with kernels
 _EXTENSION = re.compile(rb"^from ethbrake_marl\.extensions\.(\w+)", re.MULTILINE)
-
-
-class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Listener that announces the first compilation of a stored kernel in this process."""
-
-    def on_start(self, happened: event.Event) -> None:
-        if isinstance(happened.data["dispatcher"]._cache, _Cache):  # not a function of the user's
-            announce_compilation()
-
-    def on_end(self, happened: event.Event) -> None:
-        pass
-
-
-class _Postponer(event.Listener):  # type: ignore[misc]
-    """Postpone Ctrl-C while numba compiles and stores a function: LLVM's calls of Python would lose the exception."""
-
-    postponed = Postponed()
-
-    def on_start(self, happened: event.Event) -> None:
-        self.postponed.begin()
-
-    def on_end(self, happened: event.Event) -> None:
-        self.postponed.end(only_arrived=global_compiler_lock.is_locked())
-
-
-event.register("numba:compile", _Teller())
-event.register("numba:compiler_lock", _Postponer())
 
 
 class _Cache(NullCache):  # type: ignore[misc]
@@ -87,7 +57,10 @@ class _Cache(NullCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
         target_context.refresh()
         name = self._name(sig, target_context.codegen())
-        return load_data(name, lambda data: CompileResult._rebuild(target_context, *pickle.loads(data)))  # noqa: S301
+        stored = load_data(name, lambda data: CompileResult._rebuild(target_context, *pickle.loads(data)))  # noqa: S301
+        if stored is None:  # then numba compiles the function
+            announce_compilation()
+        return stored
 
     def save_overload(self, sig: Any, data: Any) -> None:
         if not data.library.has_dynamic_globals and " at 0x" not in repr(sig):  # addresses in this process

@@ -64,16 +64,13 @@ def driving(force, command, brake_rate, release_rate, duration):
 
 
 @kernel
-def capacity(car, row, i, time):
-    """Largest deceleration (``row`` BRAKING) or forward acceleration (DRIVING) of body i at ``time`` (s), m/s2."""
+def capacity(car, row, i):
+    """Largest deceleration (``row`` BRAKING) or forward acceleration (DRIVING) of body i, m/s2."""
     return car[row, i]
 
 
-def capacities(car: Floats, row: int, time_s: Floats) -> Floats:
-    """Largest deceleration (``row`` BRAKING) or forward acceleration (DRIVING) of all bodies, [n, N + 1] m/s2.
-
-    ``time_s`` [n] is the time in each world.
-    """
+def capacities(car: Floats, row: int) -> Floats:
+    """Largest deceleration (``row`` BRAKING) or forward acceleration (DRIVING) of all bodies, [n, N + 1] m/s2."""
     return car[:, row]
 
 

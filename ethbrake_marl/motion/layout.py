@@ -44,7 +44,11 @@ RELEASE_RATE = 6  # rate at which the force rises towards the command (m/s3); in
 WEIGHT = 7  # weight of the vehicle's harm in the objective `preference`
 RESTITUTION = 8  # of every impact of the world, in all columns (1)
 OWN_LATENCY = 9  # latency without the wait for news of the alert (s)
-CAR_ROWS = 10
+CAR_NAMES = (
+    *("mass", "speed limit", "latency", "braking capacity", "driving capacity"),
+    *("brake rate", "release rate", "harm weight", "restitution", "own latency"),
+)  # of these rows, in their order
+CAR_ROWS = len(CAR_NAMES)
 
 # rows of `scratch`
 COMMAND = 0  # acceleration that the body wants in this interval (m/s2)

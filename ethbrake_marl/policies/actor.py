@@ -14,13 +14,10 @@ BLOCK_ROWS = 256  # observations computed together: outputs of a layer then fit 
 
 
 class Actor:
-    """Computes the deterministic actions of a policy, each observation independently of the others.
-
-    ``tensors``: weights and biases, with the names and shapes of ``spec.tensors``.
-    """
+    """Computes the deterministic actions of a policy, each observation independently of the others."""
 
     def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s]) -> None:
-        self.spec, self.actions = spec, spec.actions
+        self.spec = spec
         self.layers = layers_of(tensors, "policy", len(spec.policy_hidden))
 
     def __call__(self, observations: Float32s) -> Float32s:
@@ -38,15 +35,13 @@ class Actor:
     def columns(self, x: Float32s) -> Float32s:
         """Actions [1, rows] for observations that are stored as columns, [F, rows]."""
         y = self.forward(x)
-        if self.spec.output == "choice":
-            return self.actions[np.newaxis, y.argmax(axis=0)]
         if self.spec.output == "clip":
             return np.clip(y, np.float32(-1.0), np.float32(1.0))
         squash(y)
         return y
 
     def forward(self, x: Float32s) -> Float32s:
-        """Outputs of the last layer, [outputs, rows], for observations as columns, [F, rows]."""
+        """Outputs of the last layer, [1, rows], for observations as columns, [F, rows]."""
         for number, (weight, bias) in enumerate(self.layers, 1):
             y = np.empty((len(weight), x.shape[1]), np.float32)
             dense(weight, bias, x, y)
@@ -61,7 +56,6 @@ class Actor:
 
 
 def check_observations(observations: Float32s, size: int) -> None:
-    """Raise ``InvalidInput`` unless observations have the shape [n, ``size``] and are finite float32 numbers."""
     if observations.ndim != 2 or observations.shape[1] != size or observations.dtype != np.float32:
         raise InvalidInput(
             f"observation: has type {observations.dtype} and shape {observations.shape}; needs type float32 and shape"

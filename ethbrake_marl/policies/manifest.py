@@ -23,7 +23,7 @@ from ethbrake_marl.registry import versions_used
 
 LONGEST_STEP_S = 1e6
 POLICY_PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "stable-baselines3", "torch")
-PHYSICS_KEY = "physics"  # key of `versions`: digest of the physics; files of earlier versions lack it
+PHYSICS_KEY = "physics"  # key of `versions`: digest of the physics
 
 Learner = Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")]
 
@@ -32,7 +32,7 @@ version_of = cache(version)  # reading one takes a millisecond
 
 
 def installed_versions() -> dict[str, str]:
-    """Versions of Python, the physics, and every package that may affect a training, name -> version."""
+    """Versions of everything that may affect a training, name -> version."""
     core_versions = {"python": platform.python_version(), PHYSICS_KEY: physics_digest()}
     return core_versions | {name: version_of(name) for name in POLICY_PACKAGES} | versions_used()
 
@@ -41,7 +41,7 @@ class Manifest(FiniteModel):
     """Everything that a policy bundle records, except the tensors."""
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
-    format_version: Literal[2, 4] = 2  # `NetworkSpec.format_version`
+    format_version: Literal[2] = 2
     algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]
     network: NetworkSpec
     observation: ObservationSchema

@@ -15,10 +15,11 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
-from ethbrake_marl.agents.team import MODEL, Agent, propose
+from ethbrake_marl.agents.team import Agent, propose
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.script_calls import begin_script
 from ethbrake_marl.episode.state import END, State
@@ -26,7 +27,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import constant_plans, rollout
-from ethbrake_marl.shields.shield import NamedShield, check_drivers, checked_drivers, spread
+from ethbrake_marl.shields.shield import NamedShield, check_drivers, checked_drivers, report_of, spread
 
 ACTION_ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the applied action
 
@@ -98,6 +99,11 @@ class EpisodeShield:
         return applied, memory._replace(
             agent=after[body], proposed=proposed, applied=applied, intervened=spread(game, state, differ, False)
         )
+
+    def measures(self, game: Game, last: State) -> dict[str, Any]:
+        memory: EpisodeShieldMemory = last.memories["shield"]
+        (body,) = self.drivers
+        return {"replaced": {"none": memory.chosen}, **report_of(self.drivers, last, {body: memory.agent})}
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
         memory: EpisodeShieldMemory = state.memories["shield"]

@@ -16,7 +16,7 @@ from ethbrake_marl.agents.team import Agent, propose
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import choose, descend
-from ethbrake_marl.episode.state import END, STEPS, TIME, State
+from ethbrake_marl.episode.state import END, STEPS, State
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.forces import capacity
 from ethbrake_marl.motion.layout import BRAKING, Floats
@@ -88,7 +88,7 @@ def write_candidates(car, clock, learners, plans, changes, single_actions, actio
                 elif 0 <= single < len(single_actions):
                     action = single_actions[single]
                 actions[k, j, c] = action
-                commands[row, j, c] = action * capacity(car[row], BRAKING, learners[c], clock[row, TIME])
+                commands[row, j, c] = action * capacity(car[row], BRAKING, learners[c])
 
 
 def rollout(

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.team import Agent, Team, check_agent
+from ethbrake_marl.agents.team import PREDICTED, Agent, Team, agents_measures, check_agent
 from ethbrake_marl.episode.game import Game, Shield
 from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.episode.state import State
@@ -83,6 +83,11 @@ def check_drivers(game: Game, drivers: Mapping[int, Agent]) -> None:
     if list(drivers) != game.settings.learners.tolist():
         names, right = (", ".join(f"vehicle_{i}" for i in bodies) for bodies in (drivers, game.settings.learners))
         raise InvalidInput(f"shield: has agents for {names}; must have one for each learner, {right or 'none'}")
+
+
+def report_of(drivers: Mapping[int, Agent], last: State, memories: Mapping[int, Any]) -> dict[str, Any]:
+    """What the agents inside a shield report (``agents_measures``), without their prediction: the shield changes it."""
+    return {name: value for name, value in agents_measures(drivers, last, memories).items() if name != PREDICTED}
 
 
 def spread(game: Game, state: State, columns: Any, script_value: Any = 0) -> Any:

@@ -37,9 +37,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.team import MODEL, Agent, propose
+from ethbrake_marl.agents.team import Agent, propose
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.play import follow_plans
 from ethbrake_marl.episode.script_calls import begin_script
 from ethbrake_marl.episode.state import State, take
@@ -47,7 +48,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
-from ethbrake_marl.shields.shield import NamedShield, ShieldReason, check_drivers, checked_drivers, spread
+from ethbrake_marl.shields.shield import NamedShield, ShieldReason, check_drivers, checked_drivers, report_of, spread
 
 NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
 
@@ -291,6 +292,12 @@ class StepShield:
         if len(good):
             memory.plan[rows[good]], memory.price[rows[good]] = plans[good], least[good]
         return reason, least
+
+    def measures(self, game: Game, last: State) -> dict[str, Any]:
+        memory: StepShieldMemory = last.memories["shield"]
+        memories = dict(zip(self.drivers, memory.agents, strict=True))
+        replaced = {"actions": memory.replaced, "none": memory.replaced == 0}
+        return {"replaced": replaced, **report_of(self.drivers, last, memories)}
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
         memory: StepShieldMemory = state.memories["shield"]

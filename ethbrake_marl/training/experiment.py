@@ -11,15 +11,16 @@ from typing import Any, NamedTuple, Protocol
 from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import Team
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.compared import Compared
-from ethbrake_marl.evaluation.door import EPISODES, SEED, evaluate
-from ethbrake_marl.evaluation.named_measures import MEASURES
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.evaluation.comparison import Comparison
+from ethbrake_marl.evaluation.evaluate import EPISODES, SEED, evaluate
+from ethbrake_marl.evaluation.measure_registry import MEASURES
 from ethbrake_marl.evaluation.results import RESULTS, write_results
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.train import TrainResult, train
+from ethbrake_marl.worlds.physics import departures_by
 from ethbrake_marl.worlds.scenario import Scenario
 
 BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
@@ -32,7 +33,7 @@ class Experiment(NamedTuple):
     """A trained policy or team, and its comparison with the baselines."""
 
     trained: TrainResult
-    compared: Compared
+    compared: Comparison
     measures: tuple[str, ...]  # names of the measures beside the usual ones
     started: float  # ``time.monotonic`` at the start (s)
 
@@ -42,11 +43,11 @@ class Experiment(NamedTuple):
 
     def in_another(
         self, scenario: Scenario, episodes: int, baselines: Sequence[str], measures: Sequence[str]
-    ) -> Compared:
+    ) -> Comparison:
         count = self.compared.harm_count
         teams = compared_teams(self.trained, scenario, count, baselines)
         seed = self.compared.result.about["seed"]
-        return Compared.of(scenario, teams, episodes=episodes, seed=seed, harm_count=count, measures=measures)
+        return Comparison.of(scenario, teams, episodes=episodes, seed=seed, harm_count=count, measures=measures)
 
 
 class ReportWriter(Protocol):
@@ -84,18 +85,20 @@ def run_experiment(
     settings: Sequence[str] = (),
     report: ReportWriter | None = None,
     on_progress: OnProgress | None = None,
+    on_unwritten: Callable[[OSError | EthBrakeError], None] | None = None,
 ) -> tuple[Experiment, Sequence[Any], str]:
     """Train, compare, and write ``results.json``, ``worlds.csv`` and a report into the run's folder.
 
     ``train_on``: scenario of the training; None: ``scenario``, in which the agents are compared. Optimising agents
     minimise the count of harm used in training (``reward.harm_count``). Ctrl-C stops the training after the current
     update, and the policy so far is compared; a second Ctrl-C raises ``KeyboardInterrupt``. Other arguments and errors
-    are as in ``train`` and ``evaluate``.
+    are as in ``train`` and ``evaluate``. ``on_unwritten`` is called if results or report cannot be written; None: the
+    error is raised.
 
     Returns the experiment, and the tables and text of the report. Raises ``InvalidInput`` at once for a scenario
     without exact impacts, which shields and reports need.
     """
-    if scenario.physics is not None:
+    if departures_by(scenario.physics):
         raise InvalidInput(
             f"scenario {scenario.name!r}: ethbrake run compares shields, which need exact impacts, and physics:"
             f" {scenario.physics} has none; use ethbrake train and ethbrake evaluate"
@@ -112,21 +115,29 @@ def run_experiment(
         recipe, train_on or scenario, directory, steps=steps, seed=seed, force=force, settings=settings,
         on_progress=on_progress,
     )  # fmt: skip
-    with RunFolder(trained.directory).stage("evaluation", trained.status):
-        note = ""
-        if trained.status == "interrupted":
-            note = (
-                f"training interrupted after {trained.steps:,} steps; now evaluating the policy so far (press Ctrl-C"
-                " again to stop immediately)"
-            )
-        tell(Progress("evaluation", 0, episodes, note=note))
-        compared = Compared.of(
-            scenario, compared_teams(trained, scenario, count, baselines), episodes=episodes, seed=list_seed,
-            harm_count=count, measures=measures, on_done=lambda worlds: tell(Progress("evaluation", worlds, episodes)),
-        )  # fmt: skip
-        write_results(trained.directory, compared.table, compared.result, "csv", force=True)
-        experiment = Experiment(trained, compared, measures, started)
-        tables, where = writer.write(experiment, tell)
+    experiment = None
+    try:
+        with RunFolder(trained.directory).stage("evaluation", trained.status):
+            note = ""
+            if trained.status == "interrupted":
+                note = (
+                    f"training interrupted after {trained.steps:,} steps; now evaluating the policy so far (press"
+                    " Ctrl-C again to stop immediately)"
+                )
+            tell(Progress("evaluation", 0, episodes, note=note))
+            compared = Comparison.of(
+                scenario, compared_teams(trained, scenario, count, baselines), episodes=episodes, seed=list_seed,
+                harm_count=count, measures=measures,
+                on_done=lambda worlds: tell(Progress("evaluation", worlds, episodes)),
+            )  # fmt: skip
+            experiment = Experiment(trained, compared, measures, started)
+            write_results(trained.directory, compared.table, compared.result, "csv", force=True)
+            tables, where = writer.write(experiment, tell)
+    except (OSError, EthBrakeError) as error:
+        if experiment is None or on_unwritten is None:
+            raise
+        on_unwritten(error)
+        tables, where = experiment.compared.table.tables(), f"policy: {trained.directory}"
     return experiment, tables, where
 
 

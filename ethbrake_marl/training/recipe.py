@@ -105,6 +105,13 @@ class TrainingRecipe(FileModel):
     title: str = Field("", description="title in one line")
     description: str = Field("", description="what the recipe is for")
     source: str = Field("", description="where the values come from")
+    scenario: str | None = Field(
+        None,
+        pattern=NAME_PATTERN,
+        exclude_if=not_,
+        description="name of the scenario on which `ethbrake train` and `ethbrake run` train, unless --scenario names"
+        " another one; if missing, paper-random",
+    )
     algorithm: str = Field(
         description="name of the learning algorithm: ppo, sac, or another registered one (ethbrake scenario parts)"
     )
@@ -125,12 +132,6 @@ class TrainingRecipe(FileModel):
         True, description="whether the return ends at the horizon, instead of continuing with the critic's estimate"
     )
     seed: int = Field(0, ge=0, lt=2**32, description="seed of worlds, networks and exploration")
-    device: str = Field(
-        "cpu",
-        exclude_if=lambda device: device == "cpu",
-        description="device that trains: cpu, or another one for which the algorithm has a variant, such as cuda or"
-        " cuda:1",
-    )
     evaluation: EvaluationPlan = Field(
         description="measurements of the policy during training: how often, and on which fixed list of worlds"
     )
@@ -368,24 +369,7 @@ ALGORITHMS: Registry[tuple[type[TrainingRecipe], type[Any] | str]] = Registry(
 )
 
 
-# Algorithms that train on another device than the CPU, from entry points only: ``ALGORITHM.DEVICE`` -> class
-VARIANTS: Registry[type[Any]] = Registry(
-    "variant of an algorithm",
-    "algorithm_variants",
-    lambda name, algorithm: VARIANTS.add(name, algorithm, lambda entry: entry is algorithm),
-)
-
-
 def algorithm_of(recipe: TrainingRecipe) -> Any:
-    """New ``Algorithm`` for a recipe. Raises ``InvalidInput`` if the algorithm cannot use the recipe's device."""
-    if recipe.device == "cpu":
-        algorithm = ALGORITHMS[recipe.algorithm][1]
-        return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()
-    name = f"{recipe.algorithm}.{recipe.device.partition(':')[0]}"
-    if name not in VARIANTS:
-        devices = "".join(f", {of} also on {kind}" for of, _, kind in (variant.partition(".") for variant in VARIANTS))
-        raise InvalidInput(
-            f"recipe {recipe.name!r}: device = {recipe.device!r}: the algorithm {recipe.algorithm} cannot train there;"
-            f" every algorithm trains on cpu{devices}"
-        )
-    return VARIANTS[name]()
+    """New ``Algorithm`` for a recipe."""
+    algorithm = ALGORITHMS[recipe.algorithm][1]
+    return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()

@@ -90,7 +90,6 @@ def train(
     scheme: Scheme | None = None,
     seed: int | None = None,
     steps: int | None = None,
-    device: str | None = None,
     force: bool = False,
     settings: Sequence[str] = (),
     measure: PolicyMeasure | None = measure_on_list,
@@ -109,7 +108,6 @@ def train(
         scheme: how several learners train together; None: as in the recipe.
         seed: seed of worlds, networks and exploration; None: as in the recipe.
         steps: decisions of all learners together, rounded up to whole updates; None: as in the recipe.
-        device: ``cpu``, or another one for which the algorithm has a variant, such as ``cuda``; None: as in the recipe.
         force: replace an earlier run in ``directory``.
         settings: changes of recipe and scenario files, ``KEY=VALUE``; only recorded, in ``config.json``.
         measure: function that takes a ``Training`` and returns a function from policies (learner -> policy) to metrics,
@@ -117,12 +115,12 @@ def train(
             fixed list of worlds; None: never measure.
         on_progress: function that is called with each ``Progress``; ``show``: print it on stderr; None: no reports.
 
-    Raises ``AlreadyExists`` for a directory that exists, ``InvalidInput`` if recipe, scenario and device do not fit
-    each other, another thread is training or the directory has a comma or a plus, ``TrainingDiverged`` if a loss or a
+    Raises ``AlreadyExists`` for a directory that exists, ``InvalidInput`` if recipe and scenario do not fit each
+    other, another thread is training or the directory has a comma or a plus, ``TrainingDiverged`` if a loss or a
     weight is not finite.
 
     """
-    changes = {"scheme": scheme, "seed": seed, "total_steps": steps, "device": device}
+    changes = {"scheme": scheme, "seed": seed, "total_steps": steps}
     training = Training.of(recipe, scenario, **{key: value for key, value in changes.items() if value is not None})
     folder = RunFolder(directory)
     check_new_run(folder.path, force=force)

@@ -139,12 +139,12 @@ class Training(NamedTuple):
 def _check(recipe: TrainingRecipe, scenario: Scenario, scheme: Scheme, learners: Sequence[str]) -> None:
     """Raise ``InvalidInput`` unless the scheme fits the number of learners, and the algorithm supports it."""
     where = f"scenario {scenario.name!r}"
-    if scenario.lines and not (recipe.mixes_lines and recipe.device == "cpu"):
+    if scenario.lines and not recipe.mixes_lines:
         mixing = [name for name, (model, _) in ALGORITHMS.usable().items() if model.mixes_lines]
         raise InvalidInput(
             f"{where}: its scenarios have different vehicles or roles, and the algorithm {recipe.algorithm} of recipe"
-            f" {recipe.name!r} trains on one line on {recipe.device}; use one of the scenarios, or, on cpu,"
-            f" another algorithm: {', '.join(mixing) or 'none of those installed'}"
+            f" {recipe.name!r} trains on one line; use one of the scenarios, or another algorithm:"
+            f" {', '.join(mixing) or 'none of those installed'}"
         )
     silent = [line.name for line in scenario.lines or (scenario,) if not line.learners]
     if silent:

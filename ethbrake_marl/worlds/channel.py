@@ -40,6 +40,7 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
+from ethbrake_marl.episode.departures import MARKS
 from ethbrake_marl.episode.layer import Layer
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, Wording, read_model, require, suggestion
@@ -84,36 +85,35 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     return periods
 
 
-class Extension:
-    """Base class of extensions of the V2X channel, which add keys to ``v2x``. Override the methods that differ.
+class ChannelKey:
+    """Base class of what a key of ``v2x`` adds to the channel, or several keys together. Override what differs.
 
-    >>> from ethbrake_marl.episode.layer import Layer
-    >>> from ethbrake_marl.worlds.channel import Extension
+    >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.worlds.quantity import ScenarioPart
     >>> class FogKeys(ScenarioPart):
     ...     fog_m: float | None = None
-    >>> class Fog(Extension):
+    >>> class Fog(eb.ChannelKey):
     ...     name, keys = "fog", FogKeys
     ...     def layer(self, v2x):
-    ...         return Layer()  # here one that limits the gaps to v2x.fog_m
+    ...         return eb.Layer()  # here one that limits the gaps to v2x.fog_m
     """
 
     name: str  # of its memory in `State.memories`
     keys: type[ScenarioPart]  # its keys of ``v2x``, with types and descriptions; none is required
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Keys of messages (``OF_MESSAGES``) that this extension needs even if ``link_latency_s`` fixes all delays."""
+        """Keys of messages (``OF_MESSAGES``) that this key needs even if ``link_latency_s`` fixes all delays."""
         return ()
 
     def is_random(self, v2x: V2X) -> bool:
-        """Whether the extension draws random numbers of its own."""
+        """Whether the key draws random numbers of its own."""
         return False
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse a scenario in which the keys of this extension make no sense."""
+        """Refuse a scenario in which ``keys`` make no sense."""
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Any:
-        """Memory of this extension for n worlds at the alert: None, an array with n rows, or a tuple of such arrays.
+        """Memory of this key for n worlds at the alert: None, an array with n rows, or a tuple of such arrays.
 
         ``numbers``: source of random numbers (``counters.uniform_numbers``). ``unheard`` [n or 1, N, N]: whether the
         vehicles' equipment excludes messages of vehicle j (last axis) to vehicle i.
@@ -124,27 +124,27 @@ class Extension:
         raise NotImplementedError
 
 
-def register_v2x_extension(key: str, extension: Extension) -> None:
-    """Register the extension for a key of ``v2x``. Entry points: ``ethbrake_marl.v2x_extensions``.
+def register_v2x_key(key: str, channel_key: ChannelKey) -> None:
+    """Register what a key of ``v2x`` adds to the channel. Entry points: ``ethbrake_marl.v2x_keys``.
 
-    Raises ``InvalidInput`` for an object that is not an ``Extension``, for a key that is not in its ``keys``, and for a
+    Raises ``InvalidInput`` for an object that is not a ``ChannelKey``, for a key that is not in its ``keys``, and for a
     ``name`` in use; ``AlreadyExists`` for a key of ``v2x`` itself.
     """
-    keys, name = getattr(extension, "keys", None), getattr(extension, "name", None)
-    if name in ("physics", "shaping", "shield"):  # memories that a game has itself
+    keys, name = getattr(channel_key, "keys", None), getattr(channel_key, "name", None)
+    if name in (MARKS, "shaping", "shield"):  # memories that a game has itself
         raise InvalidInput(f"key {key!r} of v2x: the name of its memory, {name!r}, is in use; choose another")
-    is_named = isinstance(extension, Extension) and isinstance(name, str)
+    is_named = isinstance(channel_key, ChannelKey) and isinstance(name, str)
     if not is_named or key not in getattr(keys, "model_fields", ()):
         raise InvalidInput(
-            f"key {key!r} of v2x: {extension!r:.60}: must be an Extension with a name, whose keys are a ScenarioPart"
+            f"key {key!r} of v2x: {channel_key!r:.60}: must be a ChannelKey with a name, whose keys are a ScenarioPart"
             f" with a field {key}"
         )
     if key in V2X.model_fields:
         raise AlreadyExists(f"key {key!r} of v2x: this name is already in use; give another name")
-    EXTENSIONS.add(key, extension, lambda registered: registered is extension)
+    CHANNEL_KEYS.add(key, channel_key, lambda registered: registered is channel_key)
 
 
-EXTENSIONS: Registry[Extension] = Registry("key of v2x", "v2x_extensions", register_v2x_extension)
+CHANNEL_KEYS: Registry[ChannelKey] = Registry("key of v2x", "v2x_keys", register_v2x_key)
 
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"senses": "none"},
@@ -161,7 +161,7 @@ OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "proce
 class V2X(ScenarioPart):
     """The key ``v2x`` of a scenario: the name of a preset, or a mapping with settings that differ from a preset.
 
-    Other packages may add keys (``EXTENSIONS``).
+    Other packages may add keys (``CHANNEL_KEYS``).
     """
 
     model_config = ConfigDict(extra="allow")
@@ -206,13 +206,13 @@ class V2X(ScenarioPart):
         place = ("preset",) if isinstance(value, dict) else ()
         require(isinstance(name, str) and name in PRESETS, place, name, right)
         written = value if isinstance(value, dict) else {"preset": value}
-        known = (*cls.model_fields, *EXTENSIONS)
+        known = (*cls.model_fields, *CHANNEL_KEYS)
         settings = dict(written)
         for key in written:
             close = suggestion(str(key), known) or f"known: {', '.join(known)}"
             require(key in known, (key,), UNSHOWN, f"unknown key; {close}")
-            if key in EXTENSIONS:
-                part = EXTENSIONS[key].keys.model_validate({key: written[key]})
+            if key in CHANNEL_KEYS:
+                part = CHANNEL_KEYS[key].keys.model_validate({key: written[key]})
                 settings |= part.model_dump(exclude_unset=True)
         v2x = build({**PRESETS[name], **settings, "preset": name})
         v2x._keys = frozenset({"preset", *written})
@@ -221,8 +221,8 @@ class V2X(ScenarioPart):
 
     @classmethod
     def key_fields(cls) -> Mapping[str, FieldInfo]:
-        extensions = EXTENSIONS.usable()
-        return {**cls.model_fields, **{key: extensions[key].keys.model_fields[key] for key in extensions}}
+        registered = CHANNEL_KEYS.usable()
+        return {**cls.model_fields, **{key: registered[key].keys.model_fields[key] for key in registered}}
 
     @model_serializer(mode="wrap")
     def _as_written(self, dump: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
@@ -236,11 +236,11 @@ class V2X(ScenarioPart):
 
     def _check(self) -> None:
         """Refuse keys without effect, and a channel by which a vehicle may never learn anything."""
-        extended = {EXTENSIONS[key]: key for key in self.model_extra or ()}
-        right = "belong to different extensions, whose memories have the same name; leave one out"
-        names = {extension.name for extension in extended}
+        extended = {CHANNEL_KEYS[key]: key for key in self.model_extra or ()}
+        right = "belong to different channel keys, whose memories have the same name; leave one out"
+        names = {channel_key.name for channel_key in extended}
         require(len(names) == len(extended), (), UNSHOWN, f"{' and '.join(extended.values())} {right}")
-        used_keys = [key for extension in self.extensions for key in extension.uses(self)]
+        used_keys = [key for channel_key in self.channel_keys for key in channel_key.uses(self)]
         unused_keys = [key for key in OF_MESSAGES if key not in used_keys]
         unheard = ("link_latency_s", "lost", *OF_MESSAGES)
         for useless, keys, why in (
@@ -261,19 +261,19 @@ class V2X(ScenarioPart):
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         mapping = handler(core)
         properties = dict(mapping["properties"])
-        for extension in EXTENSIONS.usable().values():
-            properties |= handler.resolve_ref_schema(handler(extension.keys.__pydantic_core_schema__))["properties"]
+        for channel_key in CHANNEL_KEYS.usable().values():
+            properties |= handler.resolve_ref_schema(handler(channel_key.keys.__pydantic_core_schema__))["properties"]
         properties = {key: {k: v for k, v in schema.items() if k != "default"} for key, schema in properties.items()}
         mapping = {**mapping, "properties": properties, "additionalProperties": False}
         return {"anyOf": [{"enum": list(PRESETS), "type": "string"}, mapping]}
 
     @property
-    def extensions(self) -> tuple[Extension, ...]:
-        """Extensions that the keys of ``v2x`` switch on. They are sorted by name, so the order of the keys has no
+    def channel_keys(self) -> tuple[ChannelKey, ...]:
+        """What the keys of ``v2x`` add to the channel. They are sorted by name, so the order of the keys has no
         effect.
         """
-        extensions = {EXTENSIONS[key] for key in self.model_extra or ()}
-        return tuple(sorted(extensions, key=lambda extension: extension.name))
+        channel_keys = {CHANNEL_KEYS[key] for key in self.model_extra or ()}
+        return tuple(sorted(channel_keys, key=lambda channel_key: channel_key.name))
 
     @property
     def timing(self) -> Literal["latency", "fixed", "messages"]:
@@ -295,8 +295,8 @@ class V2X(ScenarioPart):
         """Whether random numbers decide what vehicles know of each other, or from when on."""
         random_messages = self.hears != "none" and (self.timing == "messages" or 0.0 < self.lost < 1.0)
         random_sensing = self.senses != "none" and self.sensing_s[0] != self.sensing_s[1]
-        random_extensions = any(extension.is_random(self) for extension in self.extensions)
-        return random_extensions or (self.by_link and (random_messages or random_sensing))
+        random_keys = any(channel_key.is_random(self) for channel_key in self.channel_keys)
+        return random_keys or (self.by_link and (random_messages or random_sensing))
 
     def first_message_s(self, u: Floats) -> Floats:
         """Delay tau of the first message on each link (s since the alert), for uniform numbers ``u`` [..., PER_LINK].

@@ -10,7 +10,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from ethbrake_marl.files.model import UNSHOWN, Wording, refuse, require, suggestion
 from ethbrake_marl.files.yaml import YamlPath
 from ethbrake_marl.worlds.derived import mistakes, world_values
-from ethbrake_marl.worlds.physics import PHYSICS
+from ethbrake_marl.worlds.physics import PHYSICS, departures_by
 from ethbrake_marl.worlds.quantities import ALTERNATIVES, OF_A_TYPE, QUANTITIES, USUAL
 from ethbrake_marl.worlds.quantity import DISTRIBUTIONS
 from ethbrake_marl.worlds.roles import HOLDING_SCRIPTS, LEARNER
@@ -25,11 +25,12 @@ def check_scenario(scenario: Scenario) -> None:
     if scenario.types is not None:
         check_types(scenario.types, scenario.vehicle_types, scenario.vehicles)
     _check_declared_once(scenario)
-    _check_channel(scenario)
-    _check_roles(scenario)
     if scenario.physics is not None:
         is_known = scenario.physics in PHYSICS
         require(is_known, ("physics",), UNSHOWN, "" if is_known else str(PHYSICS.unknown(scenario.physics)))
+    _check_channel(scenario)
+    _check_roles(scenario)
+    if scenario.physics is not None:
         PHYSICS[scenario.physics].check(scenario)
     ends = world_values(scenario, scenario.ends)
     low, high = ({key: values[row : row + 1] for key, values in ends.items()} for row in (0, 1))
@@ -79,9 +80,9 @@ def _check_channel(scenario: Scenario) -> None:
     right = "works only with v2x: paper, because messages before the alert are not modelled"
     require(scenario.alert_s is None or not v2x.by_link, ("alert_s",), scenario.alert_s, right)
     right = f"is not known to physics: {scenario.physics}; leave one of the two out"
-    require(scenario.physics is None or not v2x.extensions, ("v2x",), UNSHOWN, right)
-    for extension in v2x.extensions:
-        extension.check(scenario)
+    require(not v2x.channel_keys or not departures_by(scenario.physics), ("v2x",), UNSHOWN, right)
+    for channel_key in v2x.channel_keys:
+        channel_key.check(scenario)
 
 
 def _check_roles(scenario: Scenario) -> None:

@@ -94,7 +94,7 @@ def require_one_line(scenario: Scenario) -> None:
 def _check_alike(members: Sequence[Scenario]) -> None:
     """Refuse a member that is listed twice, and members that differ in a key that all must share."""
     first, *later_members = members
-    extended = any(member.v2x.extensions for member in members)
+    extended = any(member.v2x.channel_keys for member in members)
     shared_keys = (*_ONE_FOR_ALL, "v2x") if extended else _ONE_FOR_ALL
     keys = _OF_ALL_LINES if have_different_lines(members) else shared_keys
     for k, later_member in enumerate(later_members, 1):

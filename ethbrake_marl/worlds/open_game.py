@@ -15,8 +15,8 @@ from ethbrake_marl.episode.objectives import Declared, free_pairs, objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.script_calls import guard_scripts
-from ethbrake_marl.episode.threads import chosen_threads
 from ethbrake_marl.errors import FreeImpacts
+from ethbrake_marl.parallel import chosen_threads
 from ethbrake_marl.worlds.mixture import require_one_line
 from ethbrake_marl.worlds.physics import PHYSICS
 from ethbrake_marl.worlds.sampling import WorldPool
@@ -61,9 +61,8 @@ def game_of(
         WorldPool(scenario, "training"), scenario.name, settings, rewarding, views, bodies, guard_scripts(scripts)
     )
     v2x = (scenario.members or (scenario,))[0].v2x  # members of a mixture have the same
-    if v2x.extensions:
-        layers = [extension.layer(v2x) for extension in v2x.extensions]
-        game = game.with_layers(sorted(layers, key=lambda layer: layer.stage))
+    layers = [key.layer(v2x) for key in v2x.channel_keys]
+    game = game.with_layers(sorted(layers, key=lambda layer: layer.stage))
     if scenario.physics is not None:
         physics = PHYSICS[scenario.physics]
         game = game._replace(physics=physics, rewarding=physics.rewarding(game))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ethbrake_marl.episode.departures import departures_of
 from ethbrake_marl.episode.game import Physics
 from ethbrake_marl.registry import Registry
 
@@ -12,3 +13,8 @@ def register_physics(name: str, physics: Physics) -> None:
 
 
 PHYSICS: Registry[Physics] = Registry("physics", "physics", register_physics)
+
+
+def departures_by(physics: str | None) -> frozenset[str]:
+    """Departures from the plain game of worlds whose scenario has this key ``physics`` (``episode.departures``)."""
+    return departures_of(None if physics is None else PHYSICS[physics])

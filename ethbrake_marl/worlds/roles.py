@@ -45,7 +45,7 @@ def check_role(role: str) -> str:
     if name.endswith(".py") or ".py:" in role:
         raise InvalidInput(
             f"agent {role!r}: is a function in a Python file, which a scenario cannot use (the option --agents can)"
-            "; to use the function in a scenario, register it as an agent in a package that you install"
+            "; to use the function in a scenario, register it as an agent in a file that --load names, or in a package"
         )
     if name in (LEARNER, "full_brake", "coast") and argument is not None:
         raise InvalidInput(f"agent {role!r}: {name} takes no argument")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.state import PHYSICS_MARK, State
+from ethbrake_marl.episode.state import State, mark
 from ethbrake_marl.episode.step import StepSettings, at_alert, first_decision
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.motion import layout
@@ -18,6 +18,7 @@ from ethbrake_marl.worlds.channel import PER_LINK
 from ethbrake_marl.worlds.counters import Numbers, Purpose, uniform_numbers, world_numbers
 from ethbrake_marl.worlds.derived import QuantityValues, obstacle_gap, world_values
 from ethbrake_marl.worlds.mixture import require_one_line
+from ethbrake_marl.worlds.physics import departures_by
 from ethbrake_marl.worlds.quantities import (
     CAR_QUANTITIES,
     MIXTURE,
@@ -191,12 +192,8 @@ def state_of(scenario: Scenario, quantities: QuantityValues, numbers: Numbers, u
         know[rows, 1:, 1:] = reaction_time[rows]
     for i, name in enumerate(scenario.vehicle_names):
         wanted[:, i + 1] = first_command(scenario.roles[name], quantities["braking_capacity_mps2"][:, i])
-    memories = {
-        extension.name: extension.at_alert(scenario, numbers, unheard, n) for extension in scenario.v2x.extensions
-    }
-    if scenario.physics is not None:
-        memories[PHYSICS_MARK] = None  # a mark
-    return at_alert(line, car, know, wanted, index)._replace(memories=memories)
+    memories = {key.name: key.at_alert(scenario, numbers, unheard, n) for key in scenario.v2x.channel_keys}
+    return mark(at_alert(line, car, know, wanted, index)._replace(memories=memories), departures_by(scenario.physics))
 
 
 def _draw_accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> DrawnWorlds:

@@ -12,7 +12,8 @@ from ethbrake_marl.agent_names import make_agent, open_game
 from ethbrake_marl.agents import e_v2x_bm
 from ethbrake_marl.agents.e_v2x_bm import coupled, harms
 from ethbrake_marl.agents.pairwise import CLOSED_FORM_CANDIDATES, find_candidates, harm_of_deceleration, meet, pairwise
-from ethbrake_marl.agents.team import MODEL, STATE, Team, play_to_end
+from ethbrake_marl.agents.team import Team, play_to_end
+from ethbrake_marl.episode.layer import MODEL, STATE
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import at_alert, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError

@@ -13,7 +13,7 @@ from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Team, play, play_to_end, propose
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
-from ethbrake_marl.evaluation.door import evaluate
+from ethbrake_marl.evaluation.evaluate import evaluate
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.shield import shield
 from ethbrake_marl.motion.layout import Floats

@@ -40,7 +40,7 @@ def test_help__has_examples_that_parse_and_a_short_name(
         assert ethbrake(*arguments, "--help").status == 0
 
 
-FISH = {"_ETHBRAKE_COMPLETE": "complete_fish", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --comp"}
+FISH = {"_ETHBRAKE_COMPLETE": "complete_fish", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --js"}
 
 
 @pytest.mark.parametrize(
@@ -50,8 +50,8 @@ FISH = {"_ETHBRAKE_COMPLETE": "complete_fish", "_TYPER_COMPLETE_ARGS": "ethbrake
             {"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake scenario val", "COMP_CWORD": "2"},
             "validate\n",
         ),
-        ({"_ETHBRAKE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --comp"}, '"--compile"'),
-        ({**FISH, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}, "--compile"),
+        ({"_ETHBRAKE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --js"}, '"--json"'),
+        ({**FISH, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}, "--json"),
         ({**FISH, "_TYPER_COMPLETE_FISH_ACTION": "is-args"}, ""),
         ({"_ETHBRAKE_COMPLETE": "bash_source"}, None),  # no shell sets these: nothing changes
         ({"_ETHBRAKE_COMPLETE": "1"}, None),
@@ -86,7 +86,7 @@ def test_defect_of_the_program__keeps_its_traceback_and_missing_memory_is_one_li
     with pytest.raises(RuntimeError, match="a defect"):
         ethbrake("scenario", "list")
     short = Mock(side_effect=MemoryError("Unable to allocate 9 TiB"))
-    monkeypatch.setattr("ethbrake_marl.evaluation.compared.evaluate", short)
+    monkeypatch.setattr("ethbrake_marl.evaluation.comparison.evaluate", short)
     check_refused(ethbrake("evaluate"), "not enough memory (Unable to allocate 9 TiB)", "fewer worlds")
 
 
@@ -109,7 +109,7 @@ def test_program__exit_status_and_streams_and_a_full_disk_behind_stdout() -> Non
     status, out, err = program(calling.format("evalute", ""))
     assert (status, out, err.count("\n")) == (2, "", 1)
     full = program(calling.format("--version", " os.dup2(os.open('/dev/full', os.O_WRONLY), 1);"))
-    assert full == (2, "", "ethbrake: error: output: No space left on device\n")
+    assert full == (3, "", "ethbrake: error: output: No space left on device\n")
 
 
 @pytest.mark.parametrize("encoding", [pytest.param("latin-1", marks=pytest.mark.slow), "ascii"])
@@ -196,7 +196,7 @@ def test_compilation__is_announced_once(name: str, what: str, tmp_path, monkeypa
         kernel_cache.save_data(name, b"")
     announce()
     [line] = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"compiling {what}") and "; later processes use the stored result (in advance: " in line
+    assert line.startswith(f"compiling {what}") and line.endswith("; later processes use the stored result")
     (tmp_path / "file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
     announce()

@@ -1,4 +1,4 @@
-"""``ethbrake doctor``: what it finds wrong, what it compiles."""
+"""``ethbrake doctor``: what it finds wrong."""
 
 import re
 import sys
@@ -13,6 +13,7 @@ from ethbrake_marl.agents import pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import EXTRA_OF
 from ethbrake_marl.worlds import catalogue
 from tests.fixtures.commands import Command, told_json
 
@@ -41,18 +42,10 @@ def test_doctor__names_the_folders_that_are_used() -> None:
     assert found("scenarios")[1] == f"{len(shipped)} in {shipped[0]}" and len({*shipped}) == 1
 
 
-@pytest.mark.usefixtures("empty_folder")
-def test_compiling__leaves_nothing_in_the_current_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_DOORS", [("scenario", "new", "mine")])
-    monkeypatch.setattr(doctor, "_IN_PYTHON", "open('worlds.csv', 'w').close()")
-    done, told = doctor.compile_ahead(training=False)
-    assert done and told.startswith("all kernels compiled in ") and [*Path().iterdir()] == []
-
-
 @pytest.mark.parametrize("form", [[], ["--json"]])
 def test_doctor__one_failure_gives_exit_status_1(ethbrake: Command, monkeypatch, form: list[str]) -> None:
     checks = [Check("a", True, "x"), Check("b", False, "y")]
-    monkeypatch.setattr("ethbrake_marl.cli.doctor.diagnose", lambda compile_all: checks)
+    monkeypatch.setattr("ethbrake_marl.cli.doctor.diagnose", lambda: checks)
     answer = ethbrake("doctor", *form)
     assert answer.status == 1 and ("FAIL  b  y" in answer.out) == (not form)
 
@@ -62,16 +55,16 @@ def test_dependencies__too_old_and_missing_ones_are_told(monkeypatch) -> None:
     monkeypatch.setattr(doctor, "requires", lambda name: wanted)
     assert not found("numpy")[0] and "needs >=99" in found("numpy")[1]
     assert found("no-such-package") == (False, "is not installed; needs >=1")
-    assert found("no-such-extra") == (True, "is not installed; the extra train installs it")
+    assert found("no-such-extra") == (True, "is not installed; needs >=1")
     assert found("scipy")[0]
 
 
 def test_extras__are_those_of_the_page() -> None:
     page = (Path(__file__).parents[2] / "docs" / "installing.md").read_text()
     listed = re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)
-    assert sorted(doctor.EXTRAS) == sorted(name for name in listed if name not in ("all", "docs"))
-    names = [check.name for check in dict.fromkeys(doctor._dependencies())]
-    assert {"matplotlib", "optuna", "numba-cuda"} <= {*names} and names.count("numpy") == 1
+    assert {*EXTRA_OF.values()} == {*listed} - {"all", "docs"}
+    names = [check.name for check in doctor._dependencies()]
+    assert {"matplotlib", "optuna"} <= {*names} and "pytest" not in names and names.count("numpy") == 1
 
 
 def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings(monkeypatch) -> None:
@@ -111,10 +104,3 @@ def test_kernel_cache__that_is_damaged_is_named_and_mended(tmp_path: Path, monke
     assert {path.name for path in folder.iterdir()} == {"d.compiled", "README"} and kernel_cache.load_data(
         "d", bytes
     ) == b"d"
-
-
-def test_compiling_ahead__without_a_folder_to_write_is_refused(tmp_path: Path, monkeypatch) -> None:
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
-    told = f"{tmp_path}/file/ethbrake_marl: Not a directory; {kernel_cache.UNSTORED}"
-    assert doctor.compile_ahead(training=False) == (False, told)

@@ -69,7 +69,7 @@ EVALUATIONS = [
         "runs/nothing-here: is not a folder; give the folder of a policy bundle (manifest.json, weights.safetensors)",
     ),
     (
-        "evaluate --scenario level-0-sensors --agents vine-pair",
+        "evaluate --scenario level-0-sensors --agents universal",
         "scenario 'level-0-sensors' has no learner that the agents could drive; choose the scenario",
     ),
     ("evaluate --agents team@.", ".: contains no policy; give the folder of a policy bundle"),

@@ -9,10 +9,8 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli.run import quickest, training_scenario
+from ethbrake_marl.cli.run import quickest
 from ethbrake_marl.progress import Progress, ShownProgress
-from ethbrake_marl.training.recipe import load_recipe
-from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.fixtures.commands import Command, Refuse, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
@@ -82,24 +80,34 @@ def test_run__by_default_trains_what_is_installed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scenario", "recipe", "trained_on"),
+    ("words", "trained_on", "compared_in", "horizon_s"),
     [
-        ("paper-random", "quick", "mixture-three-tests"),
-        ("paper-random-obstacle", "quick", "mixture-three-tests"),
-        ("paper-random", "ppo", "paper-random"),
-        ("paper-random-buildup", "quick", "paper-random-buildup"),
+        ([], "mixture-three-tests", "paper-random", 8.0),  # as the recipe says
+        (["--set", "horizon_s=9"], "mixture-three-tests", "paper-random", 9.0),  # a setting changes nothing else
+        (["--scenario", "paper-random"], "paper-random", "paper-random", 8.0),
+        (["--scenario", "paper-random-obstacle"], "paper-random-obstacle", "paper-random-obstacle", 8.0),
     ],
 )
-def test_run__trains_quick_on_all_three_tests_and_anything_else_alone(
-    scenario: str, recipe: str, trained_on: str
+@pytest.mark.usefixtures("core_alone")
+def test_run__trains_on_the_scenario_of_the_command_or_else_of_the_recipe(
+    words: list[str],
+    trained_on: str,
+    compared_in: str,
+    horizon_s: float,
+    ethbrake: Command,
+    tiny_recipe: Path,
+    tmp_path: Path,
 ) -> None:
-    chosen = load_recipe("ppo").replace(name=recipe)  # which needs no extension
-    assert training_scenario(chosen, load_scenario(scenario)).name == trained_on
-
-
-def test_run__trains_a_changed_test_alone() -> None:
-    changed = load_scenario("paper-random").replace(mass_t=2.0)
-    assert training_scenario(load_recipe("ppo").replace(name="quick"), changed) == changed
+    with tiny_recipe.open("a") as file:
+        file.write("\nscenario: mixture-three-tests\n")
+    answer = ethbrake("run", "--recipe", tiny_recipe, *words, "--episodes", "10", "--output", tmp_path / "run")
+    assert answer.status == 0 and answer.out.startswith(f"Trained on {trained_on} by recipe tiny")
+    (row, *_) = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert row["scenario"] == compared_in
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["scenario"]["name"] == trained_on
+    members = [entry["scenario"] for entry in config["scenario"].get("mixture", [])] or [config["scenario"]]
+    assert {member["horizon_s"] for member in members} == {horizon_s}
 
 
 def test_run__is_refused(refuse: Refuse) -> None:

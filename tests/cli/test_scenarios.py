@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation import trial
+from ethbrake_marl.cli import trial
 from tests.fixtures.commands import Answer, Command, check_refused, told_json
 
 SCRIPTS = """

@@ -112,8 +112,6 @@ def test_discount__may_be_below_that_of_the_shaping_but_not_above(
     ("words", "text"),
     [
         ("--resume runs/mine --steps 5", "--steps: cannot be combined with --resume"),
-        ("--resume runs/mine --device cuda", "--device: cannot be combined with --resume"),
-        ("--recipe ppo --device cuda", "device = 'cuda': the algorithm ppo cannot train there; every"),
         ("--other-versions", "--other-versions: has no effect on a new run"),
     ],
 )

@@ -28,5 +28,5 @@ def test_kernels__have_the_bits_of_the_functions_for_arrays() -> None:
     again = actions_of(state, [2, 3], 1.2 * commands)
     for k in range(40):
         for j, body in enumerate((2, 3)):
-            assert command_of(state.car[k], body, actions[k, j], state.time_s[k]) == commands[k, j]
-            assert action_of(state.car[k], body, 1.2 * commands[k, j], state.time_s[k]) == again[k, j]
+            assert command_of(state.car[k], body, actions[k, j]) == commands[k, j]
+            assert action_of(state.car[k], body, 1.2 * commands[k, j]) == again[k, j]

@@ -15,7 +15,7 @@ from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.play import follow_plans, price
 from ethbrake_marl.episode.reward import RewardParams, reward_params
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.evaluation.door import evaluate
+from ethbrake_marl.evaluation.evaluate import evaluate
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, DROVE, MOVING, PUSHED
 from ethbrake_marl.shields.step import StepShield
 from tests.contract.interfaces import CRASH, REST

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl import parallel
 from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode import threads
 from ethbrake_marl.episode.game import Game
@@ -24,6 +26,7 @@ N = 203  # worlds: slices of 2, 3 and 5 threads differ in length
 @pytest.fixture(autouse=True)
 def _few_worlds_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "LEAST_WORLDS", 5)
+    monkeypatch.setattr(parallel, "usable_cores", lambda: 8)
 
 
 def game_with(count: int | None) -> Game:
@@ -115,3 +118,20 @@ def test_threads__refuses_a_bad_variable(text: str, monkeypatch: pytest.MonkeyPa
 def test_threads__refuses_a_bad_number(count: Any) -> None:
     with pytest.raises(InvalidInput, match=r"^threads = .*: must be a whole number in 1..1024$"):
         game_with(count)
+
+
+def test_threads__are_never_more_than_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "usable_cores", lambda: 3)
+    monkeypatch.setenv("ETHBRAKE_THREADS", "1024")
+    assert game_with(None).settings.threads == game_with(4).settings.threads == 3
+    game, sizes = game_with(3), list[int]()
+    monkeypatch.setattr(parallel, "usable_cores", lambda: 2)  # as in a process beside others
+
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, size: int) -> None:
+            sizes.append(size)
+            super().__init__(size)
+
+    monkeypatch.setattr(threads, "ThreadPoolExecutor", Pool)
+    game.step(game.reset(game.draw(N, 5, 0)), np.zeros((N, 1)))
+    assert sizes == [2]

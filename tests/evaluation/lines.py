@@ -12,8 +12,8 @@ from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.layer import SENSORS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.evaluate import Result, evaluate_teams
-from ethbrake_marl.evaluation.identity import about_scenario
-from ethbrake_marl.evaluation.named_measures import measures_called
+from ethbrake_marl.evaluation.measure_registry import measures_called
+from ethbrake_marl.evaluation.provenance import about_scenario
 from ethbrake_marl.worlds.scenario import Scenario
 
 # Two vehicles at 20 m/s, 1 m apart, brake with 6 m/s2, the rear one from 0.5 s. By hand: at 0.5 s the gap is 0.25 m and
@@ -28,17 +28,16 @@ PAIR: dict[str, Any] = {
 FULL_BRAKE, COAST, GENTLE = Held("full_brake"), Held("coast"), Held("constant:4.0")
 
 
-class Foretold(NamedTuple):
-    predicted_harm: Any
-
-
 class Foreteller:
     """Brakes fully, and predicts the first gap as its harm."""
 
     name, knows = "foreteller", SENSORS
 
-    def begin(self, alert: State, body: int) -> Foretold:
-        return Foretold(alert.gaps_m[:, 0].copy())
+    def begin(self, alert: State, body: int) -> Any:
+        return alert.gaps_m[:, 0].copy()
+
+    def measures(self, last: State, memory: Any, body: int) -> Any:
+        return {"predicted_harm": memory}
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Any, Any]:
         return -state.braking_capacity_mps2[:, body - 1], memory

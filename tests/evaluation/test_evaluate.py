@@ -22,11 +22,11 @@ from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.terms import TERMS, register_term
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, UnknownName
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, PhysicsError, UnknownName
 from ethbrake_marl.evaluation import evaluate as evaluating
 from ethbrake_marl.evaluation.evaluate import evaluate_teams
+from ethbrake_marl.evaluation.measure_registry import MEASURES, measures_called, register_measure
 from ethbrake_marl.evaluation.measures import Measure, Statistic
-from ethbrake_marl.evaluation.named_measures import MEASURES, measures_called, register_measure
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.motion.layout import GAP
@@ -288,6 +288,81 @@ def test_measures__with_one_statistic_are_refused() -> None:
     scenario, game = open_game(PAIR)
     with refused("measures 'a' and 'b': both have the statistic 'hit'; give one of them another key"):
         evaluate_teams(scenario.draw(2, 7), teams(FULL_BRAKE), game, two)
+
+
+class Reporting:
+    """Brakes fully, and reports one measure as given."""
+
+    name, knows = "reporting", "own sensors"
+
+    def __init__(self, report: Any) -> None:
+        self.report = report
+
+    def begin(self, alert: State, body: int) -> Any:
+        return np.full(alert.n, float(body))
+
+    def act(self, state: State, memory: Any, body: int) -> tuple[Any, Any]:
+        return -state.braking_capacity_mps2[:, body - 1], memory
+
+    def measures(self, last: State, memory: Any, body: int) -> Any:
+        return self.report(last, memory)
+
+
+def test_an_agent__reports_measures_of_its_own() -> None:
+    reporting = Reporting(lambda last, memory: {"mine": 2.0 * memory, "speeds": last.speeds_mps})
+    result = eb.evaluate(PAIR, {"reporting": reporting, "full": "full_brake"}, episodes=4)
+    assert result["reporting"]["mine"].tolist() == [4.0] * 4
+    assert result["reporting"]["speeds_2"].tolist() == [0.0] * 4
+    assert not {"mine", "speeds_2"} & result["full"].keys()
+    reported, braking = summarise(result)
+    assert reported["mine"] == mean(np.full(4, 4.0)) and braking["mine"] is None
+    assert result.measure_of("mine").meaning == result.measure_of("speeds_2").meaning == evaluating.REPORTED
+
+
+def test_agents__that_report_the_same_measure_have_its_mean_but_no_common_prediction() -> None:
+    reporting = Reporting(lambda last, memory: {"mine": memory, "predicted_harm": memory})
+    both = {"vehicle_2": reporting, "vehicle_3": reporting}
+    columns = eb.evaluate("cooperation-3-pair", {"both": both}, episodes=2)["both"]
+    assert columns["mine"].tolist() == [2.5, 2.5] and "predicted_harm" not in columns
+    team = eb.shield(eb.Team.of(both, "both"))
+    shielded = eb.evaluate("cooperation-3-pair", {"both": team}, episodes=2)["both"]
+    assert shielded["mine"].tolist() == [2.5, 2.5] and shielded["replaced_none"].dtype == bool
+
+
+def test_a_shield_and_a_layer__report_measures_of_their_own() -> None:
+    class Quiet(StepShield):
+        def measures(self, game: Any, last: State) -> Any:
+            return {"certified": last.memories["shield"].settles}
+
+    class Fog(eb.Layer):
+        def measures(self, last: State) -> Any:
+            return {"fog": np.full(last.n, 0.5)}
+
+    scenario, game = open_game("paper-random")
+    quiet, bare = Team("quiet", {2: FULL_BRAKE}, Quiet({2: FULL_BRAKE})), Team("bare", {2: FULL_BRAKE})
+    result = evaluate_teams(scenario.draw(3, 7), {"quiet": quiet, "bare": bare}, game.with_layers([Fog()]))
+    assert result["quiet"]["certified"].all() and "replaced_none" not in result["quiet"]
+    assert result["bare"]["fog"].tolist() == result["quiet"]["fog"].tolist() == [0.5] * 3
+
+
+@pytest.mark.parametrize(
+    ("report", "message"),
+    [
+        (
+            lambda last, memory: {"total_harm": memory},
+            "team 'reporting': reports the measure 'total_harm', which is in",
+        ),
+        (lambda last, memory: {"a b": memory}, "measure 'a b': the name must be 1 to 64 characters"),
+        (lambda last, memory: {"mine": memory[:1]}, "measure 'mine': its function returned float64 of shape (1,)"),
+        (lambda last, memory: {"mine": memory * np.inf}, "measure 'mine': its value is inf in row 0; must be finite"),
+        (lambda last, memory: 1 / 0, "vehicle_2: measures fails: ZeroDivisionError"),
+        (lambda last, memory: 3, "vehicle_2: measures fails: TypeError"),
+    ],
+    ids=["in use", "name", "shape", "infinite", "error", "no mapping"],
+)
+def test_a_bad_report__is_refused(report: Any, message: str) -> None:
+    with pytest.raises(EthBrakeError, match=re.escape(message)):
+        eb.evaluate(PAIR, {"reporting": Reporting(report)}, episodes=2)
 
 
 @pytest.mark.parametrize(

@@ -5,18 +5,21 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl import parallel
 from ethbrake_marl.agent_names import AGENTS, WRAPPERS
-from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.cli.app import Installed, run_command, whole_command
 from ethbrake_marl.episode.features import FEATURES
 from ethbrake_marl.episode.objectives import OBJECTIVES
 from ethbrake_marl.episode.terms import TERMS
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
-from ethbrake_marl.evaluation.named_measures import MEASURES
+from ethbrake_marl.evaluation import evaluate as evaluating
+from ethbrake_marl.evaluation.measure_registry import MEASURES
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.training.recipe import ALGORITHMS
 
@@ -228,6 +231,80 @@ def test_measures__of_a_file_are_told_where_it_is_named(tmp_path: Path, capsys: 
     assert row["versions"]["mine.py"].startswith("SHA-256 ")
     found = eb.evaluate("paper-random", "full_brake", episodes=5, measures=[f"{tmp_path}/mine.py:worst"])
     assert np.mean(found["full_brake"]["worst"]) == row["worst"]
+
+
+OWN = '''
+import numpy as np
+import ethbrake_marl as eb
+
+print("noise of a file")
+
+class Half:
+    name, knows = "half", "own sensors"
+
+    def begin(self, alert, body):
+        return None
+
+    def act(self, state, memory, body):
+        return -0.5 * state.braking_capacity_mps2[:, body - 1], memory
+
+def bonus(before, step, after):
+    """Minus the square of the command."""
+    return -(after.commands_mps2**2)
+
+def weight(state, body):
+    """Mass of the vehicle."""
+    return state.mass_t[:, body - 1]
+
+eb.register_agent("half", lambda argument, settings: Half())
+eb.register_term("bonus", bonus)
+eb.register_feature("weight", weight, unit="t", scale=10.0, low=0.0, high=9.0)
+'''
+
+
+def test_load__makes_the_names_of_a_file_known_to_every_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An agent, also as the script of a role, a term and a feature; also in other processes."""
+    pytest.importorskip("joblib")
+    monkeypatch.setattr(parallel, "usable_cores", lambda: 2)
+    monkeypatch.setattr(evaluating, "CHUNK", 3)
+    (tmp_path / "own.py").write_text(OWN)
+    load = ["--load", str(tmp_path / "own.py")]
+    settings = ["roles.vehicle_3=half", "early_impacts=keep", "observation=[own, weight]", "measures=bonus"]
+    words = ["evaluate", "--agents", "full_brake,half", "--episodes", "6", "--json"]
+    words += [word for setting in settings for word in ("--set", setting)]
+    assert run_command(words) == 2 and "unknown" in capsys.readouterr().err
+    assert run_command([*words, *load]) == 0
+    alone = capsys.readouterr()
+    assert "noise of a file" in alone.err
+    full, half = json.loads(alone.out)
+    assert half["bonus_2"] < 0.0 and half["versions"]["own.py"].startswith("SHA-256 ") and full["bonus_3"] < 0.0
+    assert run_command([*words, *load, "--jobs", "2"]) == 0
+    assert json.loads(capsys.readouterr().out) == [full, half]
+    assert run_command(["scenario", "parts", *load]) == 0 and "bonus" in capsys.readouterr().out
+    assert run_command(["agent", "list", "--load", str(tmp_path / "none.py")]) == 2
+    assert "none.py': does not exist" in capsys.readouterr().err
+
+
+def test_load__is_an_option_of_every_command() -> None:
+    def commands_without(command: Any, name: str) -> list[str]:
+        made = command.command() if isinstance(command, Installed) else command
+        if hasattr(made, "commands"):
+            return [each for word, other in made.commands.items() for each in commands_without(other, f"{name} {word}")]
+        return [] if any("--load" in option.opts for option in made.params) else [name]
+
+    assert commands_without(whole_command(), "ethbrake") == []
+
+
+def test_a_measure_of_a_file__may_be_what_the_file_registers_itself(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        f"{OWN}\ndef ends(game, alert, last):\n    '''When.'''\n    return last.time_s\n"
+        "eb.register_measure('ends', ends, unit='s')\n"
+    )
+    measures = [f"{tmp_path}/own.py:bonus", f"{tmp_path}/own.py:ends"]
+    columns = eb.evaluate("paper-random", "full_brake", episodes=3, measures=measures)["full_brake"]
+    assert (columns["bonus_2"] < 0.0).all() and columns["ends"].tolist() == columns["end_s"].tolist()
 
 
 def test_scenario_recipe_and_observation__run_no_file_that_they_name(tmp_path: Path) -> None:

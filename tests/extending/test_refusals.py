@@ -11,7 +11,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.episode.features import FEATURES
 from ethbrake_marl.errors import AgentFailed, AlreadyExists, InvalidInput, UnknownName
-from ethbrake_marl.worlds.channel import Extension, register_v2x_extension
+from ethbrake_marl.worlds.channel import ChannelKey, register_v2x_key
 from ethbrake_marl.worlds.quantity import ScenarioPart
 from tests.refused import refused
 
@@ -244,19 +244,19 @@ def test_objective__arguments_are_texts_or_numbers() -> None:
             eb.register_objective("with-argument", mine, arguments=arguments)  # type: ignore[arg-type]
 
 
-def test_v2x_extension__has_a_name_and_keys() -> None:
+def test_v2x_key__has_a_name_and_keys() -> None:
     class Keys(ScenarioPart):
         gap_noise_m: float = 0.0
         lost: float = 0.0
 
-    class GapNoise(Extension):
+    class GapNoise(ChannelKey):
         name, keys = "gap_noise", Keys
 
-    for key, extension in (("gap_noise", GapNoise()), ("gap_noise_m", GapNoise), ("gap_noise_m", "text")):
-        with pytest.raises(InvalidInput, match=f"key '{key}' of v2x: .* must be an Extension with a name"):
-            register_v2x_extension(key, extension)  # type: ignore[arg-type]
+    for key, wrong in (("gap_noise", GapNoise()), ("gap_noise_m", GapNoise), ("gap_noise_m", "text")):
+        with pytest.raises(InvalidInput, match=f"key '{key}' of v2x: .* must be a ChannelKey with a name"):
+            register_v2x_key(key, wrong)  # type: ignore[arg-type]
     with pytest.raises(AlreadyExists, match="already in use"):
-        register_v2x_extension("lost", GapNoise())
+        register_v2x_key("lost", GapNoise())
 
 
 def test_commands__of_different_lengths_are_refused() -> None:

@@ -13,9 +13,9 @@ from ethbrake_marl.agent_names import register_agent
 from ethbrake_marl.episode.layer import Layer
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.faces.rendering import Renderer, register_renderer
-from ethbrake_marl.worlds.channel import register_v2x_extension
+from ethbrake_marl.worlds.channel import register_v2x_key
 from tests.contract.interfaces import BARE, PAPER, STEP, Vector, actions
-from tests.fixtures.layer import UsersExtension
+from tests.fixtures.layer import UsersKey
 
 
 class NextStep(Vector):
@@ -116,7 +116,7 @@ def shown() -> tuple[eb.Scenario, dict[str, Any]]:
 
 
 def layered() -> tuple[eb.Scenario, dict[str, Any]]:
-    register_v2x_extension("mine", UsersExtension("mine", Reporting()))
+    register_v2x_key("mine", UsersKey("mine", Reporting()))
     return SHORT.replace(v2x={"mine": 1}), {}
 
 

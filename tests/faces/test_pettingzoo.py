@@ -111,6 +111,10 @@ def test_indices__are_evenly_spaced_actions() -> None:
 
 
 REFUSED: dict[str, Callable[[], Any]] = {
+    "step: vehicle_3 follows the script full_brake, so it takes no action here; leave its action out, or make the"
+    " environment with learners=['vehicle_2', 'vehicle_3']": lambda: began(agents="learners").step(
+        {"vehicle_2": [0.0], "vehicle_3": [0.0]}
+    ),
     "step: the action of learner vehicle_2 is missing": lambda: began().step({"vehicle_1": [0.0]}),
     "unknown agent 'vehicle_9'": lambda: began().step({"vehicle_9": [0.0]}),
     "step: actions = [0.0]: must be a mapping from agent to action": lambda: began().step([0.0]),  # type: ignore[arg-type]

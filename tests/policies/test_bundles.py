@@ -56,7 +56,6 @@ def test_bundle__is_read_as_it_was_written_and_always_has_the_same_bytes(policy:
     for file in ("manifest.json", "weights.safetensors"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "run" / "policy" / file).read_bytes()
     content = json.loads((tmp_path / "a" / "manifest.json").read_text())
-    assert "choices" not in content["network"]
     assert content["versions"]["physics"] == physics_digest() and "registered" not in content["observation"]
     other = pickle.loads(pickle.dumps(policy))
     assert np.array_equal(other(observations(5)), policy(observations(5)))
@@ -193,13 +192,13 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "unknown_key": (edit(loader="os.system"), "manifest.json: loader: is an unknown key"),
     "dotted_algorithm": (edit(algorithm="subprocess.Popen"), "manifest.json: algorithm: must be 1 to 64 lower case"),
     "another_format": (edit(format="zip"), "manifest.json: format: must be ethbrake-policy"),
-    "future_version": (edit(format_version=6), "manifest.json: format_version: must be 2 or 4"),
+    "future_version": (edit(format_version=6), "manifest.json: format_version: must be 2"),
     "wrong_type": (edit(steps="many"), "manifest.json: steps: must be a whole number"),
     "giant_layer": (edit(network__policy_hidden=[10**9]), "manifest.json: network.policy_hidden.0"),
     "unknown_activation": (edit(network__activation="gelu"), "manifest.json: network.activation: must be"),
     "mixture_of_experts": (
         edit(format_version=3, network__networks=2, network__gate_hidden=[4], network__value_hidden=[]),
-        "manifest.json: format_version: must be 2 or 4",
+        "manifest.json: format_version: must be 2",
     ),
     "more_features": (
         edit(observation__features=["own.speed"]),

@@ -1,4 +1,4 @@
-"""What a policy's networks compute: by hand, with the bits of no neighbour, near torch, and as ONNX."""
+"""What a policy's networks compute: by hand, with the bits of no neighbour, and near torch."""
 
 from typing import Any
 
@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.layers import squash
 from ethbrake_marl.policies.network import NetworkSpec
-from ethbrake_marl.policies.policy import Policy
 from tests.refused import refused
 
 FIELDS: dict[str, Any] = {
@@ -22,11 +20,7 @@ BASE: dict[str, Any] = {
     "observation_size": 27, "action_size": 1, "policy_hidden": (13, 9), "value_hidden": (), "activation": "relu",
     "output": "clip",
 }  # fmt: skip
-KINDS: dict[str, dict[str, Any]] = {
-    "clip": {"value_hidden": (5,)},
-    "tanh": {"output": "tanh", "activation": "tanh"},
-    "choice": {"output": "choice", "choices": 33},
-}
+KINDS: dict[str, dict[str, Any]] = {"clip": {"value_hidden": (5,)}, "tanh": {"output": "tanh", "activation": "tanh"}}
 
 
 def network(kind: str, **more: Any) -> NetworkSpec:
@@ -43,22 +37,16 @@ def observations(n: int, size: int = 27, seed: int = 1) -> Any:
     return np.random.default_rng(seed).uniform(-2.0, 2.0, (n, size)).astype(np.float32)
 
 
-SPECS = {**{kind: network(kind) for kind in KINDS}, "wide": network("choice", choices=801)}
+SPECS = {kind: network(kind) for kind in KINDS}
 
 
 @pytest.mark.parametrize(
     ("output", "last", "expected", "tensors"),
-    [
-        ("clip", [[1.0, -2.0]], [1.0, -0.5, -1.0, 0.0], 9),
-        ("tanh", [[1.0, -2.0]], np.tanh([3.0, -0.5, -4.0, 0.0]), 10),
-        # of five actions from -1 to 1 that of the highest score, and the lowest of equal ones; without a critic
-        ("choice", [[0.0, 0.0], [1.0, 0.0], [0.0, 3.0], [2.0, 0.0], [2.0, 0.0]], [0.5, 0.0, 0.0, -1.0], 4),
-    ],
+    [("clip", [[1.0, -2.0]], [1.0, -0.5, -1.0, 0.0], 9), ("tanh", [[1.0, -2.0]], np.tanh([3.0, -0.5, -4.0, 0.0]), 10)],
 )
 def test_actor__relu_then_output_by_hand(output: str, last: Any, expected: Any, tensors: int) -> None:
     spec = NetworkSpec(
-        observation_size=1, action_size=1, policy_hidden=(2,), value_hidden=() if output == "choice" else (1,),
-        activation="relu", output=output, choices=5 if output == "choice" else None,
+        observation_size=1, action_size=1, policy_hidden=(2,), value_hidden=(1,), activation="relu", output=output,
     )  # type: ignore[arg-type]  # fmt: skip
     weights = {name: np.zeros(shape, np.float32) for name, shape in spec.tensors.items()}
     weights["policy.0.weight"][:, 0] = [1.0, -1.0]  # hidden: max(x, 0), max(-x, 0)
@@ -103,19 +91,7 @@ def test_squash__is_the_rounded_hyperbolic_tangent() -> None:
     assert actual[0, -2:].tolist() == [1.0, -1.0]
 
 
-def test_policy__says_which_format_its_network_needs() -> None:
-    versions = {"clip": 2, "tanh": 2, "choice": 4}
-    for kind, version in versions.items():
-        policy = Policy.make(tensors_for(SPECS[kind]), network=SPECS[kind], observation=View(), **FIELDS)
-        assert policy.manifest.format_version == version
-
-
-WRONG: dict[str, dict[str, Any]] = {
-    "value_hidden: must be empty if output is 'choice'": {"output": "choice", "choices": 3, "value_hidden": (5,)},
-    "choices = None: must be a number if output is 'choice'": {"output": "choice"},
-    "choices = 3: must be a number if": {"choices": 3},
-    "less than or equal to 4096": {"policy_hidden": (10**9,)},
-}
+WRONG: dict[str, dict[str, Any]] = {"less than or equal to 4096": {"policy_hidden": (10**9,)}}
 
 
 @pytest.mark.parametrize("message", WRONG)

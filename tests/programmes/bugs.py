@@ -92,10 +92,7 @@ def finder(bug: Bug, copies: SimpleQueue[Path]) -> str:
     try:
         with changed(bug, copy):
             first = near(bug.patches[0][0]) if bug.patches else []
-            twins = ["--all"] if first == ["tests/extensions/cuda"] else []  # the twins of a GPU are slow tests
-            return (first and failing(copy, [*first, *twins])) or failing(
-                copy, ["tests", *(f"--ignore={each}" for each in first)]
-            )
+            return (first and failing(copy, first)) or failing(copy, ["tests", *(f"--ignore={each}" for each in first)])
     finally:
         copies.put(copy)
 

@@ -3,14 +3,13 @@
 import re
 import subprocess
 import sys
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from ethbrake_marl.motion.digest import physics_digest
-from tests.programmes import ROOT, Told, __main__ as runner, bounds, bugs, libraries
+from tests.programmes import Told, __main__ as runner, bounds, bugs, libraries
 
 # ---------------------------------------------------------------- the runner
 
@@ -41,25 +40,6 @@ def test_runner__lists_every_programme_and_knows_no_other(capsys):
     assert runner.main([]) == 0 and {"bugs", "core", "wheel"} <= runner.programmes().keys()
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [*runner.programmes()]
     assert runner.main(["nobody"]) == 2
-
-
-# ---------------------------------------------------------------- cuda
-
-
-def test_page_of_the_gpu__says_that_nothing_was_measured_or_has_the_table(tmp_path, monkeypatch):
-    cuda = import_module("tests.programmes.cuda")
-    monkeypatch.setattr(cuda, "ROOT", tmp_path)
-    texts = {file: (ROOT / file).read_text("utf-8") for file in cuda.UNTRIED}
-    told = [untried in texts[file] for file, untried in cuda.UNTRIED.items()]
-    assert told == 2 * ["| check |" not in texts[cuda.PAGE]]
-    for file, text in texts.items():
-        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / file).write_text(text, "utf-8")
-    assert not cuda.write({"bits": Told(True), "vine": Told(False)}).good
-    assert cuda.write({"machine code": Told(None, "no compiler"), "bits": Told(True, "the same")}).good
-    page = (tmp_path / cuda.PAGE).read_text("utf-8")
-    assert "| bits | the same |\n\nMeasured: " in page and page.count("## ") == texts[cuda.PAGE].count("## ")
-    assert not any(untried in (tmp_path / file).read_text("utf-8") for file, untried in cuda.UNTRIED.items())
 
 
 # ---------------------------------------------------------------- bounds

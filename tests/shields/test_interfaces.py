@@ -186,6 +186,12 @@ def test_a_shield_that_is_registered_for_names_is_a_mode() -> None:
         shield(COAST, scenario="paper-random", mode="bare")
 
 
+@pytest.mark.parametrize("named", [{}, {"scenario": "paper-random"}], ids=str)
+def test_a_network__is_refused_with_the_name_of_the_function_that_makes_it_an_agent(named: dict[str, str]) -> None:
+    with pytest.raises(InvalidInput, match=r"nor an agent or a team; make an agent of .* eb.shield\(eb.policy_agent\("):
+        shield(lambda seen: seen[:, :1], **named)
+
+
 def test_the_term_intervention() -> None:
     reward = {"harm": 1.0, "intervention": 0.5}
     env = shield(EthBrakeParallelEnv("cooperation-3-pair", reward=reward))

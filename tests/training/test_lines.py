@@ -77,9 +77,6 @@ def test_training__needs_an_algorithm_that_mixes_lines_and_a_learner_in_every_li
     class Mixing(type(TINY)):  # type: ignore[misc]  # the class is a value here
         mixes_lines = True
 
-    on_gpu = Mixing(**TINY.model_dump(mode="json") | {"device": "cuda"})
-    with refused(f"of recipe {TINY.name!r} trains on one line on cuda; use one of the scenarios, or, on cpu, another"):
-        Training.of(on_gpu, LINES)
     with refused("scenario 'cooperation-2-five' has no learner"):
         Training.of(Mixing(**TINY.model_dump(mode="json")), silent)
 
@@ -137,6 +134,24 @@ def test_metrics__are_means_over_the_worlds_and_costs_relative_to_full_braking()
     assert [metrics["relative_paper-random"], metrics["relative_five"]] == ratios
     assert metrics["objective"] == pytest.approx((8 * ratios[0] + 2 * ratios[1]) / 10)
     assert full_braking(TRAINING)["objective"] == pytest.approx(1.0)
+
+
+def test_metrics__of_lines_with_an_objective_are_relative_to_its_cost() -> None:
+    recipe = TINY.replace(reward={"harm": 1.0, "harm_count": "total", "objective": "own"})
+    training = TRAINING._replace(recipe=recipe)
+    metrics = drive_list(training)(dict.fromkeys(training.learners, eb.make_agent("coast")))
+    ratios = []
+    for line, learners in zip(training.lines, ([2], [3, 5]), strict=True):
+        plan = line.recipe.evaluation
+        result = eb.evaluate(line.scenario, "coast,full_brake", episodes=plan.worlds, seed=plan.seed, measures="own")
+        coasting, braking = (
+            np.mean([result[agent][f"own_total_{body}"].mean() for body in learners])
+            for agent in ("coast", "full_brake")
+        )
+        ratios.append(coasting / braking)
+        harms = [result[agent]["total_harm"].mean() for agent in ("coast", "full_brake")]
+        assert coasting / braking != pytest.approx(harms[0] / harms[1])
+    assert [metrics["relative_paper-random"], metrics["relative_five"]] == pytest.approx(ratios)
 
 
 def test_metrics__of_a_line_without_cost_are_refused() -> None:

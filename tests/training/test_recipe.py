@@ -19,7 +19,6 @@ from ethbrake_marl.training.recipe import (
     ALGORITHMS,
     LearningRate,
     PpoRecipe,
-    algorithm_of,
     load_recipe,
     register_algorithm,
     shipped_recipes,
@@ -82,9 +81,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "recipe 'sac': n_steps: unknown key; did": lambda: load_recipe("sac").replace(n_steps=3),
     "recipe 'sac': ent_coef = -1: must be 'auto' or a finite number": lambda: load_recipe("sac").replace(ent_coef=-1),
     "recipe 'sac': buffer_size = 3: must be at least n_envs = 128": lambda: load_recipe("sac").replace(buffer_size=3),
-    "recipe 'ppo': device = 'GPU 0': the algorithm ppo cannot train there; every algorithm": lambda: algorithm_of(
-        PPO.replace(device="GPU 0")
-    ),
+    "recipe 'ppo': device: unknown key; known: name": lambda: PPO.replace(device="cpu"),
     "recipe 'ppo': seed = 1.5: must be a whole number": lambda: PPO.replace(seed=1.5),
 }
 

@@ -31,14 +31,7 @@ from ethbrake_marl.progress import Progress
 from ethbrake_marl.training import train as train_module
 from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.ppo import Ppo
-from ethbrake_marl.training.recipe import (
-    ALGORITHMS,
-    VARIANTS,
-    TrainingRecipe,
-    algorithm_of,
-    load_recipe,
-    register_algorithm,
-)
+from ethbrake_marl.training.recipe import ALGORITHMS, TrainingRecipe, algorithm_of, load_recipe, register_algorithm
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.train import make_environment, make_model, train
 from ethbrake_marl.training.training import Training
@@ -88,7 +81,7 @@ def test_train__reports_and_returns_what_its_folder_says(trained: tuple[Path, An
         assert told == ("finished", 6 * UPDATE, 6)
     assert status["evaluations"] == list(result.evaluations)
     assert [(report.done, report.total) for report in reports] == [(UPDATE * k, 6 * UPDATE) for k in range(7)]
-    assert TrainingRecipe.model_fields.keys() - config["recipe"].keys() == {"observation", "device"}
+    assert TrainingRecipe.model_fields.keys() - config["recipe"].keys() == {"observation"}
     assert config["settings"] == ["x=1"]
 
 
@@ -302,6 +295,18 @@ def test_train__a_second_ctrl_c_stops_at_once(tmp_path: Path) -> None:
     assert kept(tmp_path / "run") == kept(tmp_path / "whole")
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_train__a_signal_stops_it_after_the_update_and_leaves_no_handler(number: int, tmp_path: Path) -> None:
+    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.MonkeyPatch.context() as patch:
+        disturb(patch, {40: lambda _: os.kill(os.getpid(), number)})
+        assert begin("ppo", tmp_path / "run").status == "interrupted"
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
+    go_on(tmp_path / "run")
+    begin("ppo", tmp_path / "whole")
+    assert kept(tmp_path / "run") == kept(tmp_path / "whole")
+
+
 SPOILED: dict[str, Callable[[Any], Any]] = {
     "rewards": lambda answer: answer[1].__setitem__(3, np.nan),
     "huge": lambda answer: answer[1].fill(1e38),
@@ -404,10 +409,9 @@ class Gambling(A2c):
 def test_algorithm__that_draws_from_any_generator_resumes_to_the_bit(
     a2c: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(VARIANTS.loaded, "a2c.casino", Gambling)
-    settings = {"device": "casino", "measure": None}
-    train(a2c, "paper-random", tmp_path / "whole", on_progress=None, **settings)
-    killed(train, a2c, "paper-random", tmp_path / "run", on_progress=dying_after(5), **settings)
+    monkeypatch.setitem(ALGORITHMS.loaded, "a2c", (A2cRecipe, Gambling))
+    train(a2c, "paper-random", tmp_path / "whole", measure=None, on_progress=None)
+    killed(train, a2c, "paper-random", tmp_path / "run", measure=None, on_progress=dying_after(5))
     random.seed(1)
     go_on(tmp_path / "run", measure=None)
     assert kept(tmp_path / "run") == kept(tmp_path / "whole")
@@ -417,33 +421,6 @@ def test_algorithm__that_normalises_by_itself_is_refused(a2c: dict[str, Any], tm
     with refused("algorithm 'a2c': its model uses VecNormalize"):
         train({**a2c, "name": "normalising"}, "paper-random", tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-class OnDevice(A2c):
-    """A variant of A2C for another device."""
-
-    def build(self, training: Any, environment: Any) -> A2C:
-        """Model; the device is remembered."""
-        DEVICES.append(training.recipe.device)
-        return super().build(training, environment)
-
-
-DEVICES: list[str] = []
-
-
-def test_device__chooses_the_variant_of_the_algorithm_and_is_resumed(
-    a2c: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(VARIANTS.loaded, "a2c.npu", OnDevice)
-    usual = train(a2c, "paper-random", tmp_path / "usual", measure=None, on_progress=None)
-    assert not DEVICES and "device" not in usual.training.config()["recipe"]
-    killed(train, a2c, "paper-random", tmp_path / "run", device="npu:1", measure=None, on_progress=dying_after(5))
-    again = go_on(tmp_path / "run", measure=None)
-    assert DEVICES == ["npu:1"] == [again.training.recipe.device]
-    assert kept(tmp_path / "run") == kept(tmp_path / "usual")
-    with refused("device = 'npu': the algorithm ppo cannot train there; every algorithm trains on cpu, "):
-        begin("ppo", tmp_path / "new", device="npu")
-    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("name", TRAININGS)

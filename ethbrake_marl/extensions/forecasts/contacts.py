@@ -13,8 +13,9 @@ import math
 import numpy as np
 
 from ethbrake_marl.episode.commands import command_of
+from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.features import Feature
-from ethbrake_marl.episode.state import TIME, State, check_exact
+from ethbrake_marl.episode.state import TIME, State, require
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacity
@@ -110,9 +111,9 @@ def known_line(line, car, know, time, i, observer_line, parameters, commands):
         parameters[LATENCY, j], commands[j] = 0.0, force if inside else 0.0
         if j == i or force == 0.0:
             parameters[LATENCY, j] = max(car[OWN_LATENCY, j] - time, 0.0)
-            commands[j] = -capacity(car, BRAKING, j, time) if inside else 0.0
+            commands[j] = -capacity(car, BRAKING, j) if inside else 0.0
         elif inside and force < 0.0 and car[BRAKE_RATE, j] < math.inf:
-            commands[j] = -capacity(car, BRAKING, j, time)
+            commands[j] = -capacity(car, BRAKING, j)
     if first == 1 and line[GAP, 0] < FAR_M:
         observer_line[GAP, 0], first = line[GAP, 0], 0
     return first, last
@@ -135,7 +136,7 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
                 for row in range(LINE_ROWS):
                     for j in range(here.shape[1]):
                         here[row, j] = observer_line[row, j]
-                commands[i] = command_of(car[k], i, c - 1.0, clock[k, TIME])
+                commands[i] = command_of(car[k], i, c - 1.0)
                 outcome = move_line(here, parameters, commands, scratch, 0.0, FORECAST_S)
                 if outcome == FAILED:
                     failed = k
@@ -180,7 +181,7 @@ def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
 
     Raises ``PhysicsError`` if a simulation fails.
     """
-    check_exact(state, "a forecast of contacts")
+    require(state, "a forecast of contacts", SHOWN)
     bodies = state.wanted.shape[1]
     out = np.empty((state.n, len(observers), len(CONTACT) + len(CONTACT_FAR)))
     line, observer_line, parameters = (np.zeros((rows, bodies)) for rows in (LINE_ROWS, LINE_ROWS, CAR_ROWS))

@@ -19,10 +19,11 @@ import numpy as np
 
 from ethbrake_marl.episode.commands import command_of, commands_of
 from ethbrake_marl.episode.counts import amount_so_far, weights_of
+from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
 from ethbrake_marl.episode.observe import View
-from ethbrake_marl.episode.state import TIME, State, check_exact
+from ethbrake_marl.episode.state import TIME, State, require
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.forecasts.contacts import (
@@ -94,7 +95,7 @@ def plan_worlds(line, car, clock, know, observers, time_step_s, weights, memory,
                         for j in range(here.shape[1]):
                             here[row, j] = observer_line[row, j]
                     action = min(max(middle + spacing * (c - TRIALS // 2), -1.0), 0.0)
-                    commands[i] = command_of(car[k], i, action, time)
+                    commands[i] = command_of(car[k], i, action)
                     outcome = move_line(here, parameters, commands, scratch, 0.0, FORECAST_S)
                     if outcome == FAILED:
                         failed = k
@@ -114,7 +115,7 @@ def plan_worlds(line, car, clock, know, observers, time_step_s, weights, memory,
             for j in (i, i - 1, i + 1):
                 is_known = max(first, 1) <= j <= last
                 for rate in (BRAKE_RATE, RELEASE_RATE):
-                    value[f] = capacity(car[k], BRAKING, j, time) / car[k, rate, j] if is_known else 0.0
+                    value[f] = capacity(car[k], BRAKING, j) / car[k, rate, j] if is_known else 0.0
                     f += 1
     return failed
 
@@ -136,7 +137,7 @@ def middle_of_least(costs):
 
 def _plans(state: State, observers: Ints, time_step_s: float) -> Floats:
     """Features ``plan`` before scaling, [n, observers, F]. Raises ``PhysicsError`` if a simulation fails."""
-    check_exact(state, "a plan")
+    require(state, "a plan", SHOWN)
     bodies = state.wanted.shape[1]
     out = np.empty((state.n, len(observers), len(PLAN)))
     line, observer_line, parameters = (np.zeros((rows, bodies)) for rows in (LINE_ROWS, LINE_ROWS, CAR_ROWS))

@@ -1,1 +1,1 @@
-"""Learning algorithms that try several actions in the same state: vine and rollout classification."""
+"""The learning algorithm vine, which tries two actions in the same state."""

@@ -1,85 +1,83 @@
 """Vine: try a higher and a lower action in the same state; the difference in return is the gradient of the return.
 
-The name is from Schulman et al. 2015 (TRPO), who sample branches from visited states with common random numbers.
+The name is from Schulman et al. 2015 (TRPO), who sample branches from visited states with common random numbers. A
+*branch* is a copy of a running episode that is simulated to its end with other actions. Branches of one state have the
+same random numbers, so they differ only in the actions.
+
+n: branches, or worlds; m: branches that still run; L: learners, front to rear; F: features.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import Tensor, nn
 
+from ethbrake_marl.episode.counts import beside_harm
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
-from ethbrake_marl.extensions.learners.model import BranchingModel, Line, Visited
-from ethbrake_marl.extensions.learners.networks import AveragedNetwork, draw_rows, linear_layers, perceptron
-from ethbrake_marl.extensions.learners.recipes import VineRecipe
-from ethbrake_marl.motion.layout import Floats, Ints
+from ethbrake_marl.episode.observe import Observations
+from ethbrake_marl.episode.state import TIME, State
+from ethbrake_marl.extensions.learners.actor import Actor
+from ethbrake_marl.extensions.learners.recipe import VineRecipe
+from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
+from ethbrake_marl.motion.compiling import large
+from ethbrake_marl.motion.layout import FORCE, GAP, HIT, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.policies.layers import Float32s
+from ethbrake_marl.policies.network import NetworkSpec
+from ethbrake_marl.training.algorithm import Algorithm, tensors_of
+from ethbrake_marl.training.fixed_list import braking_cost
+from ethbrake_marl.training.lines import LinesVecEnv
+from ethbrake_marl.training.training import Training
+
+ROUNDING_MPS2 = 1e-5  # forces closer than this are equal: a network's rounding depends on its batch size
+
+Act = Callable[[Observations], Float32s]  # observations [rows, F] -> actions [rows] in [-1, 1]
 
 
-class ClippedActor(AveragedNetwork):
-    """A deterministic policy: the network's output, clipped to [-1, 1].
+class Vine(Algorithm):
+    """Algorithm vine. One policy controls all learners."""
 
-    ``features``: names of the observed features. Raises ``InvalidInput`` if they lack the one that the recipe's key
-    ``network.initial_action`` names.
-    """
+    def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
+        return VineModel(training, environment)
 
-    def __init__(self, features: Sequence[str], recipe: VineRecipe) -> None:
-        shape = recipe.network
-        average = perceptron(len(features), 1, shape.policy, shape.activation)
-        *hidden, last = linear_layers(average)
-        for layer in hidden:
-            nn.init.orthogonal_(layer.weight, math.sqrt(2.0))
-            nn.init.zeros_(layer.bias)
-        if isinstance(shape.initial_action, str):
-            if shape.initial_action not in features:
-                raise InvalidInput(
-                    f"recipe {recipe.name!r}: the observation lacks the feature {shape.initial_action}, which"
-                    " network.initial_action names; add it to the observation"
-                )
-            pass_through(hidden, last, features.index(shape.initial_action))
-        else:
-            nn.init.orthogonal_(last.weight, 0.01)
-            nn.init.constant_(last.bias, shape.initial_action or 0.0)
-        learning = perceptron(len(features), 1, shape.policy, shape.activation)
-        super().__init__(average, learning, recipe.learning_rate.at(1.0))
-
-    @torch.no_grad()
-    def means(self, observations: Float32s) -> Float32s:
-        """Outputs of the network in training (not of its average), [rows], for observations [rows, F]."""
-        means: Float32s = self.learning(torch.from_numpy(observations))[:, 0].numpy()
-        return means
-
-    def act(self, observations: Float32s) -> Float32s:
-        return np.clip(self.means(observations), -1.0, 1.0)
+    def tensors(self, actor: Actor, network: NetworkSpec) -> dict[str, Float32s]:
+        log_std = {"policy.log_std": np.full(1, -3.0, np.float32)}  # which never counts, because vine does not explore
+        return tensors_of("policy", actor.average) | log_std
 
 
-@torch.no_grad()
-def pass_through(hidden: Sequence[nn.Linear], last: nn.Linear, column: int) -> None:
-    """Set weights of a relu network so that its output is exactly the input x in this ``column``.
+class Line(NamedTuple):
+    """One line of vehicles of a training: that of its scenario, or one of a mixture of lines."""
 
-    The first two units of every hidden layer are max(x, 0) and max(-x, 0), and the output is their difference. The
-    weights of the other hidden units stay, but those of the output for these units are 0.
-    """
-    first, *between = hidden
-    first.weight[:2] = 0.0
-    first.weight[:2, column] = torch.tensor([1.0, -1.0])
-    for layer in between:
-        layer.weight[:2] = torch.eye(2, layer.in_features)
-    nn.init.zeros_(last.weight)
-    nn.init.zeros_(last.bias)
-    last.weight[0, :2] = torch.tensor([1.0, -1.0])
+    environment: EthBrakeVecEnv
+    tried: int  # decisions per update at which other actions are tried
+    cost: float  # returns are divided by it: 1, or in a mixture of lines the cost of full braking
+
+    @property
+    def game(self) -> Game:
+        return self.environment.game
+
+    @property
+    def learners(self) -> int:
+        return len(self.environment.bodies)
+
+
+class Visited(NamedTuple):
+    """Decisions of L learners in D visited states of a line."""
+
+    line: Line
+    observations: Float32s  # [D * L, F]
+    states: State  # [D]
 
 
 class Branches(NamedTuple):
-    """Two simulated branches of each of B visited decisions: first B with a higher action, then B with a lower one."""
+    """Two branches of each of B visited decisions: first B with a higher action, then B with a lower one."""
 
     world: Ints  # [2B] number of the visited state
     learner: Ints  # [2B] learner whose action is moved, from 0
@@ -98,15 +96,83 @@ class TrialResults(NamedTuple):
     gradient: Tensor  # [B] of the return with respect to the action
 
 
-class VineModel(BranchingModel):
-    policy: ClippedActor
-    recipe: VineRecipe
+class VineModel(BaseAlgorithm):
+    """Drives all worlds without exploration, tries other actions in branches, and learns from their returns."""
 
-    def new_policy(self) -> nn.Module:
-        return ClippedActor(self.features, self.recipe)
+    policy: Any  # an `Actor`
+
+    def __init__(self, training: Training, environment: EthBrakeVecEnv | LinesVecEnv) -> None:
+        recipe = training.recipe
+        assert isinstance(recipe, VineRecipe)
+        super().__init__(
+            nn.Module,  # type: ignore[arg-type]  # only models that explore need a policy of Stable-Baselines3
+            environment,
+            learning_rate=recipe.learning_rate.at,
+            stats_window_size=max(100, environment.num_envs),
+            device="cpu",
+            support_multi_env=True,
+            seed=recipe.seed,
+        )
+        self.recipe = recipe
+        self.rows, self.features = environment, training.row.names
+        self.lines = lines_of(training, environment)
+        self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = Actor(self.features, self.recipe)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
+
+    def dump_logs(self) -> None:
+        self.logger.dump(step=self.num_timesteps)
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Repeat ``collect`` and ``improve`` for ``total_timesteps`` decisions, with the calls of Stable-Baselines3."""
+        total, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        callback.on_training_start(locals(), globals())
+        while self.num_timesteps < total:
+            callback.on_rollout_start()
+            visited = self.collect(callback)
+            callback.on_rollout_end()
+            self._update_current_progress_remaining(self.num_timesteps, total)
+            self.improve(visited)
+        callback.on_training_end()
+        return self
+
+    def collect(self, callback: BaseCallback) -> list[Visited]:
+        """Drive all worlds for ``n_steps`` decisions."""
+        all_observations: list[Any] = []
+        states: list[list[State]] = [[] for _ in self.lines]
+        for _ in range(self.recipe.n_steps):
+            observations: Any = self._last_obs
+            all_observations.append(observations)
+            for line, line_states in zip(self.lines, states, strict=True):
+                line_states.append(line.environment.episode.take(np.arange(line.environment.n)))
+            new_obs, rewards, dones, infos = self.rows.step(self.policy.act(observations)[:, np.newaxis])
+            self.num_timesteps += self.n_envs
+            ended = [infos[row] for row in np.flatnonzero(dones)]  # only these have statistics
+            self._update_info_buffer(ended, dones[dones])
+            self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
+            callback.update_locals(locals())
+            callback.on_step()
+        visited, first = [], 0
+        for line, line_states in zip(self.lines, states, strict=True):
+            rows = slice(first, first + line.environment.num_envs)
+            line_observations = np.concatenate([observations[rows] for observations in all_observations])
+            visited.append(Visited(line, line_observations, State.join(line_states)))
+            first = rows.stop
+        return visited
 
     def improve(self, visited: Sequence[Visited]) -> None:
         results = [self.try_out(decisions) for decisions in visited]
@@ -122,11 +188,13 @@ class VineModel(BranchingModel):
         return TrialResults(torch.from_numpy(sample), torch.from_numpy(self.policy.means(sample)), gradient)
 
     def draw_branches(self, line: Line, decisions: Ints) -> Branches:
-        rows, offset = draw_rows(decisions, line.tried), self.recipe.offset
+        rows = decisions[torch.randperm(len(decisions))[: line.tried].numpy()]
+        offset, holds = self.recipe.offset, np.array(self.recipe.holds, np.int64)
         ratio = offset.largest / offset.smallest
         sizes: Floats = offset.smallest * ratio ** torch.rand(len(rows), dtype=torch.float64).numpy()
+        steps = holds[torch.randint(len(holds), (len(rows),)).numpy()]
         world, learner = np.divmod(np.tile(rows, 2), line.learners)
-        return Branches(world, learner, np.concatenate([sizes, -sizes]), np.tile(self.drawn_steps(len(rows)), 2))
+        return Branches(world, learner, np.concatenate([sizes, -sizes]), np.tile(steps, 2))
 
     def play(self, game: Game, states: State, branches: Branches) -> tuple[Floats, Floats]:
         """Discounted return of each branch's learner, and how far its actions were moved, [2B] each.
@@ -146,13 +214,13 @@ class VineModel(BranchingModel):
             moved[row] += after - before
             return actions
 
-        gained, _ = play_on(game, states.take(world), decide, self.recipe.gamma, at_least=longest)
+        gained = play_on(game, states.take(world), decide, self.recipe.gamma, at_least=longest)
         return gained[np.arange(len(size)), learner], moved
 
     def measured_gradient(self, gained: Tensor, moved: Tensor) -> Tensor:
         """Gradient of the return at each decision, [B] float32, limited to the recipe's ``gradient_limit``.
 
-        ``gained``, ``moved`` [2B]: return of each branch, and how far its actions were moved.
+        ``gained``, ``moved`` [2B]: results of ``play``.
         """
         (up, down), (higher, lower) = gained.chunk(2), moved.chunk(2)
         measured = (up - down) / (higher - lower)
@@ -167,16 +235,24 @@ class VineModel(BranchingModel):
         self._update_learning_rate(self.policy.optimizer)
         lesson, losses = (results.seen, *trusted_targets(results, recipe.trust_radius, recipe.anchor)), []
         for _ in range(recipe.n_epochs):
-            for batch in torch.split(torch.randperm(len(results.seen)).to(results.seen.device), recipe.batch_size):
-                losses.append(self.descend(*(part[batch] for part in lesson)))
+            for batch in torch.split(torch.randperm(len(results.seen)), recipe.batch_size):
+                observations, target, weight = (part[batch] for part in lesson)
+                loss = (weight * (self.policy.learning(observations)[:, 0] - target) ** 2).mean()
+                losses.append(self.policy.descend(loss, recipe.averaging).item())
         self._n_updates += recipe.n_epochs
-        self.logger.record("train/loss", float(np.mean([loss.item() for loss in losses])) if losses else 0.0)
+        self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
         self.logger.record("train/gradient", float(results.gradient.abs().mean()) if losses else 0.0)
         self.logger.record("train/tried", len(results.seen))
 
-    def descend(self, observations: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        loss = (weight * (self.policy.learning(observations)[:, 0] - target) ** 2).mean()
-        return self.policy.descend(loss, self.recipe.averaging)
+
+def lines_of(training: Training, environment: EthBrakeVecEnv | LinesVecEnv) -> list[Line]:
+    tried: int = vars(training.recipe)["tried"]
+    if isinstance(environment, EthBrakeVecEnv):
+        return [Line(environment, tried, 1.0)]
+    pairs = zip(environment.environments, training.lines, strict=True)
+    return [
+        Line(part, max(round(tried * part.n / training.recipe.n_envs), 1), braking_cost(line)) for part, line in pairs
+    ]
 
 
 def trusted_targets(results: TrialResults, radius: float, anchor: float) -> tuple[Tensor, Tensor]:
@@ -190,3 +266,77 @@ def trusted_targets(results: TrialResults, radius: float, anchor: float) -> tupl
     gradient = results.gradient.masked_fill(outward, 0.0)
     weight = gradient.abs() / radius + anchor
     return results.mean + gradient / weight, weight
+
+
+class Moment(NamedTuple):
+    """One decision in all branches that still run."""
+
+    state: State
+    seen: Observations  # [m, L, F]
+    rows: Ints  # [m] number of each branch, from 0
+    number: int  # steps so far
+
+    def ask(self, act: Act) -> Floats:
+        """Actions of all learners, chosen by the policy ``act``, [m, L] float64."""
+        return act(self.seen.reshape(-1, self.seen.shape[2])).astype(np.float64).reshape(self.seen.shape[:2])
+
+
+def play_on(game: Game, state: State, decide: Callable[[Moment], Floats], gamma: float, *, at_least: int = 0) -> Floats:
+    """Simulate episodes to the end; return each learner's discounted return, [n, L].
+
+    ``decide`` returns the learners' actions at a ``Moment``, [m, L]. ``gamma``: discount per step. If harm is the
+    reward's only term, an episode also ends, after ``at_least`` steps, when no vehicle will ever move again.
+    """
+    learners, only_harm = game.settings.learners, set(game.rewarding.counted) <= {"harm"}
+    gained, rows = np.zeros((state.n, len(learners))), np.flatnonzero(~state.ended)
+    now, discount, number = state.take(rows), 1.0, 0
+    while len(rows):
+        after, step = game.step(now, decide(Moment(now, game.observe_alike(now, learners), rows, number)))
+        gained[rows] += discount * step.reward[:, learners - 1]
+        over = after.ended
+        if only_harm and number >= at_least:
+            over |= stands_for_good(now, after, game.settings.weights)
+        if over.any():
+            rows, after = rows[~over], after.take(~over)
+        now, discount, number = after, discount * gamma, number + 1
+    return gained
+
+
+def stands_for_good(before: State, after: State, weights: Floats) -> Bools:
+    """Whether all vehicles of a world stand and will never move again, if actions depend only on observations, [n].
+
+    True if this step changed nothing, no vehicle waits for its latency or a message, and no vehicle presses against one
+    that it could still push (in the count of harm with these ``weights`` [6]). Always False if scripts, messages or a
+    shield have a memory.
+    """
+    out = np.zeros(after.n, np.bool_)
+    if not after.memories:
+        find_standing(before.line, after.line, after.car, after.know, before.clock, weights, out)
+    return out
+
+
+@large
+def find_standing(
+    before: Floats, line: Floats, car: Floats, know: Floats, clock: Floats, weights: Floats, out: Bools
+) -> None:
+    """Write the result of ``stands_for_good`` to ``out`` [n]. ``before``, ``line``: ``State.line`` before and after."""
+    bodies = line.shape[2]
+    for k in range(len(out)):
+        time = clock[k, TIME]
+        grown = beside_harm(line[k], weights) - beside_harm(before[k], weights)
+        stands = grown == 0.0
+        for i in range(bodies):
+            stands = stands and before[k, SPEED, i] == 0.0 and line[k, SPEED, i] == 0.0
+        if stands:
+            for i in range(bodies):
+                stands = stands and before[k, GAP, i] == line[k, GAP, i] and before[k, HIT, i] == line[k, HIT, i]
+                stands = stands and abs(before[k, FORCE, i] - line[k, FORCE, i]) < ROUNDING_MPS2
+                stands = stands and (car[k, LATENCY, i] < time or car[k, LATENCY, i] == math.inf)
+                for j in range(bodies):
+                    stands = stands and (know[k, i, j] < time or know[k, i, j] == math.inf)
+        out[k] = stands
+
+
+def moving(state: State) -> Bools:
+    """Whether any vehicle of a world moves, [n]."""
+    return np.asarray(state.line[:, SPEED].any(axis=1))

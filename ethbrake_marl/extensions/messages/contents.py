@@ -12,7 +12,7 @@ CONTENTS = {
         "mass_known": "features:KNOWN.mass",
         "intent_known": "features:KNOWN.intent",
     },
-    "v2x_extensions": {
+    "v2x_keys": {
         "persistence": "declared:DEFAULT_MESSAGES",
         "tells": "declared:DEFAULT_MESSAGES",
         "reports": "reports:REPORTS",

@@ -25,7 +25,7 @@ from ethbrake_marl.extensions.messages.links import (
 )
 from ethbrake_marl.files.model import UNSHOWN, require
 from ethbrake_marl.motion.layout import Bools, Floats
-from ethbrake_marl.worlds.channel import PER_LINK, V2X, Extension
+from ethbrake_marl.worlds.channel import PER_LINK, V2X, ChannelKey
 from ethbrake_marl.worlds.counters import Numbers
 from ethbrake_marl.worlds.quantities import NEWS, OF_WORLD
 from ethbrake_marl.worlds.quantity import ScenarioPart
@@ -65,15 +65,15 @@ class MessageKeys(ScenarioPart):
     )
 
 
-class Messages(Extension):
-    """Extension that the keys ``persistence`` and ``tells`` of ``v2x`` switch on."""
+class Messages(ChannelKey):
+    """What the keys ``persistence`` and ``tells`` add to the channel."""
 
     name, keys = "messages", MessageKeys
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
         """Keys of ``v2x`` that affect messages after the first.
 
-        Raises an error if a key of this extension is set but has no effect.
+        Raises an error if one of these keys is set but has no effect.
         """
         tells = _value(v2x, "tells")
         right = "needs a channel with separate messages; use a preset that generates messages, such as nominal"

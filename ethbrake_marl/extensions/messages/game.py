@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.features import GROUPS, side_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import Layer, LayeredScript, observe_through
 from ethbrake_marl.episode.observe import Observations, View
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.extensions.messages.belief import (
     ages_s,
     belief_of,
@@ -53,6 +54,7 @@ class MessagesLayer(Layer):
     stage = 1
 
     def first_decision(self, game: Game, alert: State, state: State) -> State:
+        require(alert, "v2x: messages with content", SHOWN)
         if not alert.memories[MESSAGES_KEY].is_periodic:
             return state
         sent = partial(game.seen, body=0, before=self)

@@ -21,7 +21,7 @@ from ethbrake_marl.files.model import require
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.elementary import normal_quantile_each
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats
-from ethbrake_marl.worlds.channel import V2X, Extension
+from ethbrake_marl.worlds.channel import V2X, ChannelKey
 from ethbrake_marl.worlds.counters import Numbers
 from ethbrake_marl.worlds.quantities import OF_WORLD
 from ethbrake_marl.worlds.quantity import ScenarioPart
@@ -94,7 +94,7 @@ class ReportKeys(ScenarioPart):
     )
 
 
-class Reports(Extension):
+class Reports(ChannelKey):
     """Errors in what vehicles report and measure of each other (key ``reports`` of ``v2x``).
 
     The errors are noise and bias of speeds, and one vehicle that lies about its acceleration and intent.

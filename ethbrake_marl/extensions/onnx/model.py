@@ -47,23 +47,14 @@ def to_onnx(policy: Policy) -> bytes:
     zero = constant("zero", np.zeros(1, np.float32))
     bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
 
-    def actor() -> str:
-        x = "observation"
-        for layer in [*(f"policy.{k}" for k in range(len(spec.policy_hidden))), "policy.output"]:
-            weight, bias = (constant(f"{layer}.{part}", tensors[f"{layer}.{part}"]) for part in ("weight", "bias"))
-            x = node("Gemm", [x, weight, bias], transB=1)
-            if not layer.endswith("output"):
-                x = node("Relu" if spec.activation == "relu" else "Tanh", [x])
-        if spec.output == "tanh":
-            return node("Tanh", [x])
-        if spec.output == "clip":
-            return node("Clip", [x, *bounds])
-        # [n, 1]: repeats the choices in every row
-        zeros = node("Mul", [node("ReduceMax", [x], axes=[1], keepdims=1), zero])
-        actions = node("Add", [zeros, constant("choices", spec.actions[np.newaxis])])
-        return node("GatherElements", [actions, node("ArgMax", [x], axis=1, keepdims=1)], axis=1)
-
-    action = node("Identity", [actor()], output="action")
+    x = "observation"
+    for layer in [*(f"policy.{k}" for k in range(len(spec.policy_hidden))), "policy.output"]:
+        weight, bias = (constant(f"{layer}.{part}", tensors[f"{layer}.{part}"]) for part in ("weight", "bias"))
+        x = node("Gemm", [x, weight, bias], transB=1)
+        if not layer.endswith("output"):
+            x = node("Relu" if spec.activation == "relu" else "Tanh", [x])
+    bounded = ("Tanh", [x]) if spec.output == "tanh" else ("Clip", [x, *bounds])
+    action = node(*bounded, output="action")
     capacities = []  # in m/s2, [n, 1] each
     for name in CAPACITIES:
         column, scale = columns[name]

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.departures import OBSTACLE
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.proofs.line import (
     A_F,
@@ -38,7 +39,7 @@ from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.forces import stopping_distances
 from ethbrake_marl.motion.impact import TOUCH_MPS
 from ethbrake_marl.motion.interval import solo
-from ethbrake_marl.motion.layout import BRAKE_RATE, FAR_M, LATENCY, RELEASE_RATE, Bools, Floats, Ints
+from ethbrake_marl.motion.layout import BRAKE_RATE, FAR_M, LATENCY, Bools, Floats, Ints
 
 ROUNDING_M = 1e-12  # a smaller overlap is a rounding error at gap 0, not an impact
 SQUEEZE_M = 1e-9  # if less room than this remains between both neighbours, contact counts as unavoidable
@@ -232,11 +233,11 @@ def avoidability(state: State, body: int = 2) -> Avoidability:
     proof covers Vehicle 2 of three vehicles, and either of two vehicles; all others brake fully from their latencies
     on. An overlap of at most 1e-12 m in the computed motion is a rounding error, not contact.
 
-    Raises ``InvalidInput`` for any other line, if the physics has another digest than ``PROVEN_FOR``, if brakes build
-    up, if the front vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if
-    Vehicle 1 could reach an obstacle before any contact.
+    Raises ``InvalidInput`` for any other line, for worlds that depart from the plain game other than by an obstacle
+    that Vehicle 1 does not reach before any contact, if the physics has another digest than ``PROVEN_FOR``, or if the
+    front vehicle may brake only after the controlled vehicle may act.
     """
-    _check_covered(state, body)
+    _check_assumptions(state, body)
     out, rows = np.empty((state.n, VERDICT)), rows_of(state, body)
     decide_worlds(rows, out)
     start = state.time_s + rows[:, ONSET_F]
@@ -247,13 +248,13 @@ def avoidability(state: State, body: int = 2) -> Avoidability:
     return Avoidability(reason, out[:, MARGIN].copy(), switch, command)
 
 
-def _check_covered(state: State, body: int) -> None:
-    """Raise ``InvalidInput`` unless the proof covers these worlds; ``body``: the controlled vehicle.
+def _check_assumptions(state: State, body: int) -> None:
+    """Raise ``InvalidInput`` unless the proof holds in these worlds; ``body``: the controlled vehicle.
 
     An obstacle is allowed if Vehicle 1 does not reach it under full braking: only a push could bring Vehicle 1 there,
     and a push begins with an impact.
     """
-    check_exact(state, "a proof")
+    require(state, "a proof", {OBSTACLE})
     if physics_digest() != PROVEN_FOR:
         raise InvalidInput(
             f"avoidability, lower_bound: proven for other physics ({PROVEN_FOR!r}) than this installation's"
@@ -265,12 +266,10 @@ def _check_covered(state: State, body: int) -> None:
             " vehicle_2 in a line of 3 vehicles, and both vehicles in a line of 2"
         )
     first = state.car[:, :, 1]
-    onset, now = np.maximum(state.car[:, LATENCY] - state.time_s[:, np.newaxis], 0.0), state.speeds_mps
-    way = stopping_distances(now[:, 0], onset[:, 1], state.braking_capacity_mps2[:, 0], first[:, BRAKE_RATE])
+    onset, speed = np.maximum(state.car[:, LATENCY] - state.time_s[:, np.newaxis], 0.0), state.speeds_mps[:, 0]
+    way = stopping_distances(speed, onset[:, 1], state.braking_capacity_mps2[:, 0], first[:, BRAKE_RATE])
     obstacle = state.obstacle_gap_m
     for bad, words in (
-        (np.isfinite(state.car[:, [BRAKE_RATE, RELEASE_RATE], 1:]).any(axis=(1, 2)), "has brakes that build up"),
-        (~(now >= 0.0).all(axis=1), "has a vehicle that moves backward"),
         (np.isfinite(obstacle) & (body == 1), "has an obstacle ahead of the controlled vehicle_1"),
         (~(way < obstacle), "has an obstacle that vehicle_1 reaches although it brakes"),
         ((onset[:, 1] > onset[:, body]), "has a vehicle_1 that may brake only after the controlled vehicle may act"),

@@ -65,7 +65,7 @@ def rows_of(state: State, body: int, time_step_s: float = 0.0) -> Floats:
     line, car, at = state.line, state.car, np.zeros((state.n, LINE_COLUMNS))
     onset = np.maximum(car[:, LATENCY] - state.time_s[:, np.newaxis], 0.0)
     at[:, [GAP_L, GAP_R]] = FAR_M
-    braking, driving = (capacities(car, row, state.time_s) for row in (BRAKING, DRIVING))
+    braking, driving = (capacities(car, row) for row in (BRAKING, DRIVING))
     at[:, [V_F, A_F, U_F]] = np.stack([line[:, SPEED, body], braking[:, body], driving[:, body]], axis=1)
     at[:, LIMIT_F], at[:, ONSET_F] = car[:, LIMIT, body], onset[:, body]
     at[:, BOUNCE], at[:, TIME_STEP] = state.restitution, time_step_s

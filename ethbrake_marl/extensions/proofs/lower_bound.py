@@ -6,7 +6,6 @@ Proof: docs/proofs/harm.md. Arguments: ``proofs/__init__.py``.
 from __future__ import annotations
 
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -54,6 +53,7 @@ from ethbrake_marl.extensions.proofs.plans import braking
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.interval import solo
 from ethbrake_marl.motion.layout import LIMIT, Bools, Floats
+from ethbrake_marl.parallel import chosen_threads
 
 LEAST_TIME_STEP_S = 1e-3  # shorter steps between decisions would take too long
 
@@ -280,8 +280,8 @@ def lower_bound(
             rows[part], until[part], has_front[part], has_rear[part], unavoidable[part], cells, boxes, memory, out[part]
         )
 
-    with ThreadPoolExecutor(os.cpu_count() or 1) as threads:
-        list(threads.map(bound, range(0, state.n, _AT_ONCE)))
+    with ThreadPoolExecutor(chosen_threads(None)) as pool:
+        list(pool.map(bound, range(0, state.n, _AT_ONCE)))
     parts = (now.harm(count), out[:, FRONT_BOUND], out[:, REAR_BOUND], out[:, COMBINED_BOUND])
     early, front, rear, combined = (np.maximum(part - rounding(state, body), 0.0) for part in parts)
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined)

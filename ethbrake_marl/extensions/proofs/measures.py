@@ -51,7 +51,8 @@ def proven_cost(game: Game, alert: State, last: State) -> MeasureValue:
 def _bound(game: Game, alert: State, count: str) -> LowerBound:
     body, settings = _controlled_body(game, alert), game.settings
     ends = np.array([body, settings.horizon_s, settings.time_step_s])
-    request = ends.tobytes() + alert.line.tobytes() + alert.car.tobytes()
+    departures = " ".join(sorted(alert.departures)).encode()  # a stored bound must not pass worlds that are refused
+    request = departures + ends.tobytes() + alert.line.tobytes() + alert.car.tobytes()
     if request != _bound_cache.get(count, (b"",))[0]:
         bound = lower_bound(alert, body, count=count, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s)
         _bound_cache[count] = request, bound
@@ -65,10 +66,7 @@ def _controlled_body(game: Game, alert: State, *, together: bool = False) -> int
     """
     learners = game.settings.learners.tolist()
     scripted_bodies = [body for body in range(1, alert.vehicles + 1) if body not in learners]
-    if (
-        game.scripts
-        or (alert.wanted[:, scripted_bodies] != -capacities(alert.car, BRAKING, alert.time_s)[:, scripted_bodies]).any()
-    ):
+    if game.scripts or (alert.wanted[:, scripted_bodies] != -capacities(alert.car, BRAKING)[:, scripted_bodies]).any():
         raise InvalidInput(
             "avoidable, proven_harm, proven_cost: a vehicle that does not learn does not brake fully; all others must"
         )

@@ -13,20 +13,18 @@ from markupsafe import Markup
 from ethbrake_marl.agent_names import AGENTS, WRAPPERS
 from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.captions import caption
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.evaluation.summary import BASELINE, IDENTITY, SummaryTable
-from ethbrake_marl.evaluation.summary_row import SummaryRow
+from ethbrake_marl.evaluation.summary import BASELINE, IDENTITY, SummaryRow, SummaryTable, caption
 from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.figures import harm_above, harm_by_agent
 from ethbrake_marl.extensions.report.page import Section, drawing, page_part, table, whole_page
-from ethbrake_marl.extensions.report.three_tests import SHORT_TABLE
 from ethbrake_marl.files.sheet import CellText, Column, Sheet
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Bools
 
+SHORT_TABLE = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of a short table, if they are shown
 LEARNED_AGENTS = ("trained policy", "trained team")  # names that get an article
 COUNTED_WORDS = {  # count -> verb, noun, and what is counted
     "first": ("does", " harm", "first impacts"),
@@ -35,12 +33,8 @@ COUNTED_WORDS = {  # count -> verb, noun, and what is counted
 }
 
 
-def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]) -> str:
-    """First sentence of the page: the harm of the agent ``focus`` compared with full braking.
-
-    It also names the tests in which the agent does not do less harm than full braking. ``tests``: title of another test
-    -> its results with the same agents.
-    """
+def first_sentence(compared: Comparison, focus: str, tests: Mapping[str, Comparison]) -> str:
+    """First sentence of the page: ``focus`` against full braking; also the ``tests`` in which it is not better."""
     count, harm = compared.harm_count, COLUMN[compared.harm_count]
     rows, best_known = {row.agent: row for row in compared.table}, BestKnown.of(compared.result)
     row, before = rows[focus], rows.get(BASELINE)
@@ -73,10 +67,7 @@ def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]
 
 
 def change_of(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """Whether an agent does less or more harm than full braking. ``harm``: column of the harm.
-
-    "as much": the 95 % interval of the difference contains 0, or is unknown.
-    """
+    """Whether an agent does less harm than full braking; "as much": the interval contains 0, or is unknown."""
     difference = row[f"{harm}_difference"]
     if difference is None or (difference.interval is None and row.episodes > 1):
         return "as much"
@@ -108,7 +99,7 @@ GLOSSARY = {
 
 class Test(NamedTuple):
     about: str  # how it differs
-    compared: Compared
+    compared: Comparison
 
 
 @dataclass(frozen=True)
@@ -116,7 +107,7 @@ class ReportPage:
     """Content of a report. When the page is made, its agents drive the worlds that it shows once more."""
 
     title: str
-    compared: Compared
+    compared: Comparison
     summary: str  # one or two sentences about the agents
     settings: Mapping[str, object]  # by name
     focus: str = ""  # agent that the page is mainly about; "": the last one with a policy, or the last one
@@ -195,11 +186,8 @@ def measure_parts(agents: SummaryTable) -> list[Markup]:
     return [line, page_part("folded", "Every measure", tables)]
 
 
-def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> Section:
-    """Section with a table of the worlds in which ``focus`` did worst, at most ten.
-
-    ``watched``: rows of the worlds that the page can play back; these rows get a button that starts the player.
-    """
+def worst_section(compared: Comparison, focus: str, watched: Collection[int]) -> Section:
+    """Worlds in which ``focus`` did worst. The rows ``watched`` get a button that starts the player."""
     result, known_best, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
     counts = {**HARM, minimised: COLUMN[minimised]}
     columns = {IN_WORDS[count].capitalize(): result[focus][column] for count, column in counts.items()}
@@ -222,12 +210,8 @@ def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> S
     )
 
 
-def avoidable_section(compared: Compared) -> Section:
-    """Section on regret (harm minus best known harm): a figure, and tables.
-
-    The tables divide the worlds by whether an impact is proven unavoidable. If no best known harm has been measured:
-    only a figure of the harm.
-    """
+def avoidable_section(compared: Comparison) -> Section:
+    """Section on regret, or on harm if no best harm is known; by whether an impact is proven unavoidable."""
     result, best_known, figure = compared.result, BestKnown.of(compared.result), harm_above(compared)
     if best_known is None:
         words = "For each harm x: share of the worlds in which an agent did more harm than x."
@@ -246,11 +230,8 @@ def avoidable_section(compared: Compared) -> Section:
     return Section("What was avoidable", [*body, drawing(figure, "Regret", words)])
 
 
-def _harm_among(compared: Compared, best_known: BestKnown, where: str, among: Bools) -> Sheet:
-    """Table of each agent's collision rate, harm and regret in the worlds of the mask ``among`` [n].
-
-    ``where``: description of these worlds, for the title.
-    """
+def _harm_among(compared: Comparison, best_known: BestKnown, where: str, among: Bools) -> Sheet:
+    """Table of each agent's collision rate, harm and regret in the worlds of the mask ``among`` [n]."""
     result, counts = compared.result, shown_counts(compared)
     some, rows = result.take(among), []
     for agent, harm_columns in some.columns.items():
@@ -279,7 +260,7 @@ def _test_body(test: Test) -> list[str]:
     return [test.about, short_table(rows, test.compared.harm_count), *notes, *measure_parts(rows)]
 
 
-def write_evaluation(path: Path, compared: Compared, command: str, *, force: bool = False) -> None:
+def write_evaluation(path: Path, compared: Comparison, command: str, *, force: bool = False) -> None:
     scenario, agents = compared.scenario, [row.agent for row in compared.table]
     names = ", ".join(agents)
     scripts = ", ".join(f"{vehicle} by {role}" for vehicle, role in scenario.roles.items() if role != "learner")

@@ -36,10 +36,11 @@ import numpy as np
 from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.commands import check_actions, commands_of, proposal_array
 from ethbrake_marl.episode.counts import OF_FIRST, OF_PASSED, OF_TOTAL
+from ethbrake_marl.episode.departures import BACKWARD, MAP
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.reward import Rewarding, RewardParams
 from ethbrake_marl.episode.script_calls import ask_scripts
-from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, TIME, State
+from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, TIME, State, require as require_covered
 from ethbrake_marl.episode.step import COST, FIRST_HARM, OUT_ROWS, SAFE_END, TERMINATED, TOTAL_HARM, TRUNCATED, Step
 from ethbrake_marl.episode.terms import pair_energies
 from ethbrake_marl.errors import InvalidInput
@@ -127,6 +128,8 @@ def paper_collision(params: RewardParams, before: State, step: Step, after: Stat
 class PaperMap:
     """The paper's fixed-step map as the physics of a game (``episode.game.Physics``)."""
 
+    departures = frozenset({MAP})
+
     def check(self, scenario: Scenario) -> None:
         """Raise an error for a scenario that has an obstacle, or brakes that build up."""
         right = "is not known to physics: paper-map; leave one of the two out"
@@ -154,14 +157,9 @@ class PaperMap:
     def first_decision(self, game: Game, alert: State) -> State:
         """State of each episode at its first decision. ``alert``: worlds at the alert.
 
-        Raises ``InvalidInput`` if a world has an impact before its first decision, or belongs to a scenario with exact
-        impacts.
+        Raises ``InvalidInput`` if a world has an impact before its first decision, or departs from the plain game.
         """
-        if alert.is_exact:
-            raise InvalidInput(
-                f"scenario {game.name!r}: these worlds belong to a scenario with exact impacts; draw or read them with"
-                " a scenario that has physics: paper-map"
-            )
+        require_covered(alert, "physics: paper-map", {MAP, BACKWARD})
         state = one_step.first_decision(alert, game.deciders, game.settings)
         if state.collided.any():
             raise InvalidInput(
@@ -202,7 +200,7 @@ def with_commands(game: Game, state: State, actions: Floats | None) -> State:
     proposals = proposal_array(learners, actions, state.n)
     if np.isnan(proposals).any():
         check_actions(learners, proposals[np.isnan(proposals).any(axis=1).argmax()])
-    state = ask_scripts(game.scripts, state)
+    state = ask_scripts(game.agents(game.scripts), state)
     commands = commands_of(state, learners, proposals)
     state.wanted[:, learners] = np.where(state.ended[:, np.newaxis], state.wanted[:, learners], commands)
     return state

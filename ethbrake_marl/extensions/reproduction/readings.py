@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal, NamedTuple
 
-from ethbrake_marl.evaluation.door import SEED
+from ethbrake_marl.evaluation.evaluate import SEED
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.scenario import Scenario
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from ethbrake_marl.extensions.search.search import compact, search_profiles
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.parallel import chosen_threads
 
 SEARCH_BUDGET = 20_000  # profiles that are simulated in each world, in each count
 SEARCH_CHUNK = 200  # worlds that are searched together
@@ -50,15 +50,13 @@ def best_harm(
     Args:
         game: game of the worlds' scenario.
         alert: worlds at the alert.
-        counts: counts of harm to search, one after the other (``episode.counts``). A profile found for one count is
-            also tried for the others.
+        counts: counts of harm to search (``episode.counts``); each also tries the profiles of those before.
         bodies: vehicles that are controlled (1: Vehicle 1); None: the learners.
         budget: number of profiles that are simulated in each world, for each count.
         seed: seed of the random search.
-        threads: number of threads; None: one for each core.
+        threads: number of threads; None: the environment variable ``ETHBRAKE_THREADS``, or 1.
         first_profiles: profiles that are tried first, [n] each, with any number of phases.
-        objective: what is minimised, in each count, as in a scenario's key ``objective``; ``total``: the harm of the
-            line. The table holds the values of this objective.
+        objective: what is minimised, as in a scenario's key ``objective``; ``total``: the harm of the line.
 
     Raises ``InvalidInput`` for other counts, bodies or objectives, for a budget below 1 and for physics without exact
     impacts.
@@ -66,7 +64,7 @@ def best_harm(
     """
     if not counts or not set(counts) <= set(COUNTS) or len(set(counts)) < len(counts):
         raise InvalidInput(f"counts = {tuple(counts)}: must be some of {', '.join(COUNTS)}, each once")
-    effort = {"budget": budget, "seed": seed, "threads": (os.cpu_count() or 1) if threads is None else threads}
+    effort = {"budget": budget, "seed": seed, "threads": chosen_threads(threads)}
     problem = problem_of(game, alert, bodies, objective=objective)
     outcomes = [(profiles, problem.values(profiles)) for profiles in first_profiles]
     for count in counts:
@@ -143,7 +141,7 @@ def search_list(
         threads: as for ``best_harm``.
         options: other arguments of ``best_harm``.
 
-    Raises ``InvalidInput`` if ``known_table`` contains none of the worlds, and the errors of ``best_harm``.
+    Raises the errors of ``best_harm``, and ``InvalidInput`` if ``known_table`` contains none of the worlds.
 
     """
     parts = []
@@ -178,10 +176,7 @@ def search_list(
 
 
 def agent_commands(problem: Problem, game: Game, alert: State, team: Team) -> Floats:
-    """Commands of a team that drives the worlds, at all T decisions of ``problem``, [n, T, B] m/s2.
-
-    After the end of the episodes, the last commands are repeated.
-    """
+    """Commands of a team at all T decisions of ``problem``, [n, T, B] m/s2; at the end the last repeat."""
     bodies, states = sorted(team.drivers), play(game, alert, team)
     next(states)
     commands = np.stack([state.wanted[:, bodies] for _, state in states], axis=1)
@@ -189,6 +184,6 @@ def agent_commands(problem: Problem, game: Game, alert: State, team: Team) -> Fl
 
 
 def driven_profiles(problem: Problem, game: Game, alert: State, team: Team) -> Profiles:
-    """Commands of a team that drives the worlds, as profiles with one phase for each change of command."""
+    """Commands of a team, as profiles with one phase for each change of command."""
     steps = Profiles.of_steps(agent_commands(problem, game, alert, team), problem.last_step)
     return Profiles.join([compact(*profile) for profile in zip(*steps, strict=True)])

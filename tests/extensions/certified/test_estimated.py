@@ -9,7 +9,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.certified.estimated import MedianLine, in_order
-from ethbrake_marl.extensions.certified.estimating import EstimatedEV2XBM, EstimatedShield
+from ethbrake_marl.extensions.certified.estimating import EstimatedShield
 from ethbrake_marl.extensions.certified.robust import reset_without_shield
 from ethbrake_marl.motion.layout import BRAKING, GAP, HIT, LATENCY, MASS, OWN_LATENCY, SPEED
 from tests.extensions.certified.attack import attacked
@@ -77,22 +77,13 @@ def test_an_old_message__is_moved_on_by_the_script_to_the_truth() -> None:
         "senses": "front",
         "sensing_s": [5, 5],
     }
-    agent, places = EstimatedEV2XBM(BASE.replace(v2x=channel)), []
-
-    class Spy(EstimatedEV2XBM):
-        def act(self, state: State, memory: Any, body: int) -> Any:
-            _, memory = super().act(state, memory, body)
-            free = ~state.pair_hit.any(axis=1)
-            places.append(
-                (memory.median.line[free][:, [SPEED, GAP], :-1] - state.line[free][:, [SPEED, GAP], :-1], free)
-            )
-            return np.full(state.n, -6.0), memory
-
-    loaded, game = eb.open_game(agent.scenario)
-    for _ in eb.play(game, loaded.sample(40, 7), eb.Team("spy", {2: Spy(loaded)})):
-        pass
-    assert len(places) > 20 and places[11][1].sum() > 3
-    assert max(np.abs(far).max(initial=0.0) for far, _ in places[:12]) < 1e-9
+    for steps in range(12):
+        _, state, median = lines_at(BASE.replace(v2x=channel), 40, steps, action=-1.0)
+        free = ~state.pair_hit.any(axis=1)
+        np.testing.assert_allclose(
+            median.line[free][:, [SPEED, GAP], :-1], state.line[free][:, [SPEED, GAP], :-1], rtol=0.0, atol=1e-9
+        )
+    assert free.sum() > 3
 
 
 def test_a_piece_that_messages_lack__is_the_middle_of_its_range() -> None:
@@ -130,20 +121,10 @@ def test_in_order__who_is_not_known_stays_between_those_who_are() -> None:
 # ------------------------------------------------------------------------------------------------ the shield
 
 
-AGENTS = ["coast+step:estimated", "coast+episode:estimated", "e_v2x_bm:estimated"]
 GOLDEN = {  # mean harm in 30 worlds, by the count that is made small
-    "cooperation-2-blocked": {
-        "first": [26.239734505385506, 31.984008260539056, 26.876069750023735],
-        "total": [27.615168295394938, 35.88159449248051, 28.179980360275234],
-    },
-    "cooperation-1-front": {
-        "first": [14.930262064118896, 18.512439515909037, 16.99873033957755],
-        "total": [17.83345378708621, 20.21256360789145, 18.66911077885396],
-    },
-    "paper-random-obstacle": {
-        "first": [50.60192703455983, 53.61643805729179, 52.16013013340158],
-        "total": [93.64931164059325, 105.25361452519387, 96.45518421288983],
-    },
+    "cooperation-2-blocked": {"first": 26.239734505385506, "total": 27.615168295394938},
+    "cooperation-1-front": {"first": 14.930262064118896, "total": 17.83345378708621},
+    "paper-random-obstacle": {"first": 50.60192703455983, "total": 93.64931164059325},
 }
 
 
@@ -161,23 +142,13 @@ def test_news__never_make_the_shield_drop_a_better_plan() -> None:
     assert (state.know[:, 2, 3] <= state.time_s).any()
 
 
-def test_e_v2x_bm__chooses_again_when_it_hears_something_new() -> None:
-    loaded, game = eb.open_game(LATER)
-    team, again = eb.Team("one", {2: EstimatedEV2XBM(loaded)}), 0
-    states = [state for _, state in eb.play(game, loaded.sample(40, 7), team)]
-    for before, now, after in zip(states, states[1:], states[2:], strict=False):
-        heard = (now.know[:, 2, 3] <= now.time_s) & (now.know[:, 2, 3] > before.time_s)
-        again += int((heard & (after.wanted[:, 2] != now.wanted[:, 2])).sum())
-    assert again > 3
-
-
 @pytest.mark.parametrize("name", GOLDEN)
-def test_decisions__of_shields_and_e_v2x_bm_stay_what_they_were(name: str) -> None:
+def test_decisions__stay_what_they_were(name: str) -> None:
     scenario = eb.load_scenario(name)
     scenario = scenario.replace(v2x="blocked") if name.startswith("paper") else scenario
     for column, (count, expected) in zip(("first_impact_harm", "total_harm"), GOLDEN[name].items(), strict=True):
-        found = eb.evaluate(scenario, AGENTS, episodes=30, seed=11, harm_count=count)
-        assert [found[agent][column].mean() for agent in AGENTS] == pytest.approx(expected, rel=1e-9)
+        found = eb.evaluate(scenario, "coast+step:estimated", episodes=30, seed=11, harm_count=count)
+        assert found["coast+step:estimated"][column].mean() == pytest.approx(expected, rel=1e-9)
 
 
 def test_where_everything_is_known__the_bound_is_that_of_step_mode() -> None:
@@ -215,9 +186,8 @@ def decided(spec: str, scenario: eb.Scenario, alert: State) -> tuple[Any, Any]:
 @pytest.mark.parametrize(
     ("spec", "channel"),
     [
-        ("e_v2x_bm:estimated", "periodic"), ("e_v2x_bm:estimated", "no capacity"), ("coast+step:estimated", "blocked"),
-        ("coast+step:estimated", "periodic"), ("coast+step:estimated", "no capacity"),
-        ("ppo+episode:estimated", "front alone"),
+        ("coast+step:estimated", "blocked"), ("coast+step:estimated", "periodic"),
+        ("coast+step:estimated", "no capacity"), ("ppo+step:estimated", "front alone"),
     ],
 )  # fmt: skip
 def test_what_was_not_received__changes_no_command(spec: str, channel: str) -> None:
@@ -237,18 +207,17 @@ def test_what_was_not_received__changes_no_command(spec: str, channel: str) -> N
     assert unaware.sum() > 10 and (one[0] == two[0])[unaware].all()
 
 
-@pytest.mark.parametrize("spec", ["ppo+step:estimated", "ppo+episode:estimated"])
 @pytest.mark.parametrize("channel", ["sensors-only", "front alone"])
-def test_when_the_next_news_will_come__changes_no_first_plan(spec: str, channel: str) -> None:
+def test_when_the_next_news_will_come__changes_no_first_plan(channel: str) -> None:
     scenario = BASE.replace(v2x=CHANNELS.get(channel, channel))
-    team, game = eb.make_agent(spec, scenario=scenario), eb.open_game(scenario)[1]
+    team, game = eb.make_agent("ppo+step:estimated", scenario=scenario), eb.open_game(scenario)[1]
     alert, memories = scenario.sample(40, 7), []
     later = (alert.know[:, 2, 3] > alert.car[:, LATENCY, 2]).nonzero()[0]
     for when in (alert.know[later, 2, 3], 0.0, 9.0):
         know = alert.know.copy()
         know[later, 2, 3] = np.maximum(when, alert.car[later, LATENCY, 2] + 0.01)
         memories.append(team.game(game).reset(alert._replace(know=know)).memories["shield"])
-    harm = [memory.policy_harm if "episode" in spec else memory.price for memory in memories]
+    harm = [memory.price for memory in memories]
     assert len(later) > 10 and (harm[0] == harm[1]).all() and (harm[0] == harm[2]).all()
 
 
@@ -267,36 +236,22 @@ def test_a_policy_in_its_estimated_line__knows_when_the_others_react() -> None:
 
 
 @pytest.mark.parametrize(
-    "spec",
-    ["coast+step:estimated", "ppo+episode:pairwise:estimated", "e_v2x_bm:estimated", "e_v2x_bm:pairwise:estimated"],
-)
-@pytest.mark.parametrize(
     "scenario",
     [PERIODIC, eb.load_scenario("cooperation-2-five").replace(v2x="blocked", roles={"vehicle_2": "learner"})],
     ids=str,
 )
-def test_no_world_depends_on_the_batch(spec: str, scenario: eb.Scenario) -> None:
+def test_no_world_depends_on_the_batch(scenario: eb.Scenario) -> None:
     _, game = eb.open_game(scenario)
-    worlds, agent = scenario.sample(5, 3), eb.make_agent(spec, scenario=scenario)
-    team = agent if isinstance(agent, eb.Team) else eb.Team(spec, {2: agent})
+    worlds, team = scenario.sample(5, 3), eb.make_agent("coast+step:estimated", scenario=scenario)
+    assert isinstance(team, eb.Team)
     whole, alone = eb.play_to_end(game, worlds, team), eb.play_to_end(game, worlds.take([4]), team)
     np.testing.assert_array_equal(whole.line[4], alone.line[0])
 
 
 def test_knowledge_and_names() -> None:
-    specs = "e_v2x_bm:estimated,coast+step:estimated,ppo+episode:pairwise:estimated"
-    knows = ["estimated model", "own sensors + estimated model", "messages + estimated model"]
+    specs = "coast+step:estimated,ppo+step:estimated"
+    knows = ["own sensors + estimated model", "messages + estimated model"]
     assert [*eb.evaluate(DEAF, specs, episodes=1).knows.values()] == knows
-
-
-def test_a_role_is_the_same_agent_as_a_driver() -> None:
-    base = BASE.replace(latency_s=0.0)
-    scripted = base.replace(roles={"vehicle_2": "e_v2x_bm:estimated", "vehicle_3": "learner"})
-    by_role = eb.evaluate(scripted, "full_brake", episodes=5)["full_brake"]["total_harm"]
-    assert (
-        by_role.tolist()
-        == eb.evaluate(base, "e_v2x_bm:estimated", episodes=5)["e_v2x_bm:estimated"]["total_harm"].tolist()
-    )
 
 
 def test_the_environment_says_that_the_bound_is_of_the_estimate() -> None:
@@ -315,14 +270,13 @@ def test_latencies_that_are_over__are_not_waited_for_again() -> None:
         name="late", vehicles=2, gaps_m=15, speeds_mps=[0, 10], braking_capacity_mps2=5, driving_capacity_mps2=5,
         mass_t=1, latency_s=[0, 0.6], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
     )  # fmt: skip
-    for spec in ("full_brake+episode:estimated", "e_v2x_bm:estimated"):
-        harm = eb.evaluate(late, spec, episodes=1)[spec]["first_impact_harm"]
-        assert harm == pytest.approx([10.0**2 - 2 * 5 * 9])  # 9 m are left when it begins to brake
+    harm = eb.evaluate(late, "full_brake+step:estimated", episodes=1)["full_brake+step:estimated"]["first_impact_harm"]
+    assert harm == pytest.approx([10.0**2 - 2 * 5 * 9])  # 9 m are left when it begins to brake
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "needs a scenario": lambda: eb.make_agent("e_v2x_bm:estimated"),
-    "this is a mixture; give one of": lambda: eb.evaluate("mixture-delays", "e_v2x_bm:estimated", episodes=2),
+    "needs a scenario": lambda: eb.make_agent("coast+step:estimated"),
+    "this is a mixture; give one of": lambda: eb.evaluate("mixture-delays", "coast+step:estimated", episodes=2),
     "but vehicle_3 is driven by 'idm'": lambda: eb.make_agent(
         "coast+step:estimated", scenario=BASE.replace(roles={"vehicle_2": "learner", "vehicle_3": "idm"})
     ),
@@ -330,9 +284,6 @@ REFUSED: dict[str, Callable[[], object]] = {
         "coast+step:estimated", scenario="cooperation-3-pair"
     ),
     "'gaps_m=1' cannot follow the colon": lambda: eb.make_agent("coast+step:gaps_m=1:estimated", scenario=BASE),
-    "must be e_v2x_bm:estimated or e_v2x_bm:pairwise:estimated": lambda: eb.make_agent(
-        "e_v2x_bm:coupled:estimated", scenario=BASE
-    ),
 }  # fmt: skip
 
 

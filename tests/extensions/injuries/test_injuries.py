@@ -11,7 +11,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.errors import UnknownName
-from ethbrake_marl.evaluation.named_measures import measures_called
+from ethbrake_marl.evaluation.measure_registry import measures_called
 from ethbrake_marl.extensions.injuries.curves import expected_injuries, risks, speed_changes
 from tests.episode.lines import later, state_of
 from tests.episode.test_harm import met, of_objective

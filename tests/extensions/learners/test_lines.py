@@ -12,10 +12,10 @@ import torch
 from stable_baselines3.common.callbacks import CallbackList
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.learners.start import ranged_weights
+from ethbrake_marl.extensions.learners.actor import start_weights
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.train import resume, train
-from tests.extensions.learners.tiny import PAPER, ROLLOUTS, VINE, new_model
+from tests.extensions.learners.tiny import PAPER, VINE, new_model
 from tests.fixtures.commands import Command, told_json
 from tests.refused import refused
 from tests.training.tiny import dying_after, kept, killed
@@ -36,6 +36,10 @@ def test_update__joins_the_decisions_of_all_lines_and_divides_their_returns() ->
     visited = model.collect(callback)
     assert [len(part.observations) for part in visited] == [4 * 6, 4 * 2 * 2]
     assert [part.states.vehicles for part in visited] == [3, 5] and model.num_timesteps == 4 * 10
+    for part, scenario, bodies in zip(visited, (PAPER, FIVE), ([2], [3, 4]), strict=True):
+        _, game = eb.open_game(scenario, observation=SEEN)
+        seen = np.stack(game.observe(part.states, np.array(bodies)), axis=1)
+        np.testing.assert_array_equal(part.observations, seen.reshape(part.observations.shape))
     for part in visited:
         torch.manual_seed(5)
         relative = model.try_out(part).gradient
@@ -47,6 +51,16 @@ def test_update__joins_the_decisions_of_all_lines_and_divides_their_returns() ->
     model.train_actor = lesson.append
     model.improve(visited)
     assert len(lesson[0].seen) == len(lesson[0].gradient) == 12 + 4
+
+
+def test_cost__of_each_line_is_what_full_braking_costs_in_its_part_of_the_list() -> None:
+    costs = [line.cost for line in new_model(MIXING, LINES).lines]
+    parts = ((PAPER, 8), (FIVE, 2))  # of the 10 worlds of the fixed list, by the weights 3 and 1
+    right = [
+        eb.evaluate(scenario, "full_brake", episodes=n, harm_count="honest")["full_brake"]["honest_cost"].mean()
+        for scenario, n in parts
+    ]
+    assert costs == pytest.approx(right) and costs[0] != pytest.approx(costs[1])
 
 
 def begin(run: Path, **settings: Any) -> Any:
@@ -90,27 +104,23 @@ def test_command__shows_costs_relative_to_full_braking(ethbrake: Command, empty_
     )
 
 
-def test_rollout_classification__needs_one_line() -> None:
-    with refused("and the algorithm rollout-classification of recipe"):
-        new_model(ROLLOUTS, LINES)
-
-
 def test_network__begins_as_a_policy_in_its_range_and_as_a_feature_elsewhere() -> None:
-    policy, random = load_shipped("vine-pair"), np.random.default_rng(0)
+    policy, random = load_shipped("ppo"), np.random.default_rng(0)
     features = ["plan.action", *reversed(policy.observation.names), "own.extra"]
-    sizes = [len(features), 64 + 2 + 2 * 34 + 3, 64 + 3 + 2, 4 + 1, 1]
+    sizes = [len(features), 128 + 2 + 2 * 27 + 3, 128 + 3 + 2, 4 + 1, 1]
     names = ["policy.0", "policy.1", "policy.2", "policy.output"]
     network = {
         f"{name}.{part}": random.normal(size=(after, before) if part == "weight" else after).astype(np.float32)
         for name, before, after in zip(names, sizes[:-1], sizes[1:], strict=True)
         for part in ("weight", "bias")
     }
-    tensors = ranged_weights(policy, network, features, "plan.action", "mine")
+    recipe = VINE.replace(name="mine", network={"policy": [8], "initial_action": "plan.action"})
+    tensors = start_weights(policy, network, features, recipe)
     known = policy.manifest.training_range
     assert known is not None
-    inside = random.uniform(known.low, known.high, (200, 34)).astype(np.float32)
+    inside = random.uniform(known.low, known.high, (200, 27)).astype(np.float32)
     outside = inside.copy()
-    outside[np.arange(200), np.arange(200) % 34] += np.where(np.arange(200) % 2, 3.0, -9.0)
+    outside[np.arange(200), np.arange(200) % 27] += np.where(np.arange(200) % 2, 3.0, -9.0)
     plan = random.uniform(-1, 0, 200).astype(np.float32)
 
     def output(observed: Any) -> Any:
@@ -126,23 +136,24 @@ def test_network__begins_as_a_policy_in_its_range_and_as_a_feature_elsewhere() -
     for name in names[:-1]:  # units that are not needed keep their weights
         np.testing.assert_array_equal(tensors[f"{name}.weight"][-1], network[f"{name}.weight"][-1])
     small = {**network, "policy.2.bias": np.zeros(3, np.float32)}
-    with refused("recipe 'mine': network.policy must have 3 layers with at least 134, 67, 4 units, to begin as"):
-        ranged_weights(policy, small, features, "plan.action", "mine")
+    with refused("recipe 'mine': network.policy must have 3 layers with at least 184, 131, 4 units, to begin as"):
+        start_weights(policy, small, features, recipe)
     with refused("recipe 'mine': start: must name a relu policy whose bundle has the range of its training"):
-        ranged_weights(policy.with_range(None), network, features, "plan.action", "mine")
+        start_weights(policy.with_range(None), network, features, recipe)
     with refused("recipe 'mine': the observation lacks the features own.speed"):
-        ranged_weights(policy, network, ["plan.action"], "plan.action", "mine")
+        start_weights(policy, network, ["plan.action"], recipe)
 
 
 def test_training__starts_from_a_policy_and_a_feature(tmp_path: Path) -> None:
     still = MIXING.replace(
-        start="vine-pair", observation=["own", "front_1", "rear_1", "role", "obstacle", "plan"], total_steps=1,
-        network={"policy": [140, 70, 8], "initial_action": "plan.action"}, learning_rate={"start": 1e-12, "end": 1e-12},
+        start="ppo", observation=["own", "front_1", "rear_1", "role", "obstacle", "plan"], total_steps=1,
+        network={"policy": [190, 135, 8], "initial_action": "plan.action"},
+        learning_rate={"start": 1e-12, "end": 1e-12},
     )  # fmt: skip
     policy = train(still, LINES, tmp_path / "run", measure=None, on_progress=None).policy
-    agents = {"pair": "vine-pair", "plan": "plan", "policy": eb.LearnedAgent(policy)}
-    home = eb.evaluate("cooperation-3-pair", agents, episodes=200)
-    same = np.isclose(home["policy"]["honest_cost"], home["pair"]["honest_cost"], atol=1e-2)
+    agents = {"ppo": "ppo", "plan": "plan", "policy": eb.LearnedAgent(policy)}
+    home = eb.evaluate("paper-random", agents, episodes=200)
+    same = np.isclose(home["policy"]["honest_cost"], home["ppo"]["honest_cost"], atol=1e-2)
     assert same.mean() > 0.8  # the range leaves out a thousandth of each feature's values at each end
     away = eb.evaluate("realistic-truck", agents, episodes=200)
     np.testing.assert_allclose(away["policy"]["honest_cost"], away["plan"]["honest_cost"], atol=1e-3)

@@ -10,10 +10,8 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.learners.model import Visited
-from ethbrake_marl.extensions.learners.networks import linear_layers
-from ethbrake_marl.extensions.learners.start import widen
-from ethbrake_marl.extensions.learners.vine import ClippedActor, TrialResults, trusted_targets
+from ethbrake_marl.extensions.learners.actor import Actor, linear_layers, widen
+from ethbrake_marl.extensions.learners.vine import TrialResults, Visited, trusted_targets
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.train import train
@@ -87,7 +85,7 @@ def test_untrained_policy__brakes_as_the_plan_that_it_begins_as(tmp_path: Path) 
 
 def test_network__begins_as_a_feature_exactly_and_can_learn_from_all_others() -> None:
     torch.manual_seed(0)
-    actor = ClippedActor(["own.speed", "plan.action", "own.mass"], PLAN)
+    actor = Actor(["own.speed", "plan.action", "own.mass"], PLAN)
     observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     np.testing.assert_array_equal(actor.means(observations), observations[:, 1])
     actor.descend((actor.learning(torch.from_numpy(observations)) ** 2).mean(), 0.5)

@@ -1,4 +1,4 @@
-"""Trainings of a second by algorithms of this extension, and models that have not learned yet."""
+"""Trainings of a second by vine, and models that have not learned yet."""
 
 from __future__ import annotations
 
@@ -22,12 +22,6 @@ SHORT = {
     "evaluation": {"every_updates": 4, "worlds": 10, "seed": 7}, "checkpoint_every_updates": 1,
 }  # fmt: skip
 VINE = load_recipe("vine").replace(start=None, network={"policy": [8]}, reward={"harm": 1.0}, **SHORT)
-ROLLOUTS = load_recipe("rollout-classification").replace(
-    memory=40,  # fills up on the way
-    gradient_steps=3,
-    network={"policy": [8], "choices": 9},
-    **SHORT,
-)
 
 
 def new_model(recipe: Any, scenario: Any = PAPER) -> Any:

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode import layer
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.evaluate import hidden_from
+from ethbrake_marl.worlds.open_game import game_of
 
 OLD = eb.load_scenario("cooperation-2-paper").replace(
     v2x={"link_latency_s": 0.3, "persistence": "periodic", "senses": "none"}, early_impacts="keep"
@@ -21,15 +23,15 @@ class Seeing:
 
     name = "seeing"
 
-    def __init__(self, knows: str) -> None:
-        self.knows, self.states = knows, list[State]()
+    def __init__(self, knows: str, share: float = 0.3) -> None:
+        self.knows, self.share, self.states = knows, share, list[State]()
 
     def begin(self, alert: State, body: int) -> None:
         """Remember nothing."""
 
     def act(self, state: State, memory: None, body: int) -> Any:
         self.states.append(state)
-        return -0.3 * state.car[:, 3, body], memory
+        return -self.share * state.car[:, 3, body], memory
 
 
 def driven(scenario: eb.Scenario, agent: Any, n: int = 6) -> list[State]:
@@ -62,12 +64,78 @@ def test_a_policy__observes_as_in_its_environment(scenario: eb.Scenario, shielde
     assert wrong > 10
 
 
-def test_an_agent__sees_what_it_says_that_it_knows() -> None:
-    for knows, true in (("messages", False), ("own sensors", False), ("true state", True), ("true model", True)):
-        agent = Seeing(knows)
-        states = driven(OLD, agent)
-        same = [np.array_equal(one.line, other.line) for one, other in zip(agent.states, states, strict=False)]
-        assert len(same) > 10 and all(same[1:]) == true, knows
+KNOWLEDGE = {  # what an agent says that it knows -> whether it sees the true state
+    None: False,  # it has no attribute `knows`
+    "not stated": False,
+    "own sensors": False,
+    "messages": False,
+    "estimated model": True,
+    "true state": True,
+    "true model": True,
+}
+
+
+def saw_the_truth(agent: Seeing, states: list[State]) -> list[bool]:
+    return [np.array_equal(one.line, other.line) for one, other in zip(agent.states, states, strict=False)]
+
+
+def test_knowledge__has_no_value_that_is_not_tested() -> None:
+    assert {*KNOWLEDGE} == {None, "not stated", *layer.KNOWLEDGE}
+
+
+@pytest.mark.parametrize(("knows", "true"), KNOWLEDGE.items(), ids=str)
+def test_an_agent__sees_the_true_state_only_if_it_claims_more(knows: str | None, true: bool) -> None:
+    agent = Seeing(knows or "not stated")
+    if knows is None:
+        del agent.knows  # as an object that is made without `Team.of`
+    same = saw_the_truth(agent, driven(OLD, agent))
+    assert len(same) > 10 and all(same[1:]) == true
+
+
+@pytest.mark.parametrize(("knows", "true"), KNOWLEDGE.items(), ids=str)
+def test_a_script_of_a_role__sees_the_true_state_only_if_it_claims_more(knows: str | None, true: bool) -> None:
+    script = Seeing(knows or "not stated")
+    if knows is None:
+        del script.knows
+    scenario, game = game_of(OLD, {3: script})
+    state, states = game.reset(scenario.sample(6, 7)), list[State]()
+    states.append(state)  # at the alert
+    for _ in range(12):
+        states.append(state)
+        state, _ = game.step(state, np.full((6, 1), -0.3))
+    same = saw_the_truth(script, states)
+    assert len(same) == 13 and all(same[1:]) == true
+
+
+def speeds_seen(knows: str) -> list[float]:
+    """Speeds that an agent of Vehicle 2 sees at its second decision in ``messages-noisy``, after full braking."""
+    scenario, game = eb.open_game("messages-noisy")
+    agent = Seeing(knows, share=1.0)
+    list(eb.play(game, scenario.sample(1, 7), eb.Team("one", {2: agent})))
+    return agent.states[1].speeds_mps[0].round(3).tolist()
+
+
+def test_a_silent_agent__sees_noisy_messages() -> None:
+    assert speeds_seen("true state") == [16.849, 20.787, 21.023]
+    assert speeds_seen("not stated") == speeds_seen("own sensors") == [19.801, 20.787, 20.502]
+
+
+@pytest.mark.parametrize(
+    ("knows", "words", "through"),
+    [
+        ("not stated", "not stated, filtered", False), ("own sensors", "own sensors", False),
+        ("messages", "messages", False), ("estimated model", "estimated model", False),
+        ("true state", "† true state", True), ("true model", "† true model", True),
+    ],
+)  # fmt: skip
+def test_a_row__says_who_is_filtered_and_who_sees_through(knows: str, words: str, through: bool) -> None:
+    (row,) = eb.summarise(eb.evaluate("messages-noisy", {"mine": Seeing(knows)}, episodes=3))
+    assert (row.about, row.sees_through) == (words, through)
+
+
+def test_a_row__of_a_silent_agent_that_no_layer_filters_says_so() -> None:
+    (row,) = eb.summarise(eb.evaluate("paper-random", {"mine": Seeing("not stated")}, episodes=3))
+    assert row.about == "not stated"
 
 
 def test_hidden__is_old_news_and_what_messages_lack() -> None:

@@ -101,7 +101,7 @@ def test_scenario__says_what_is_declared_and_can_be_made_of_it() -> None:
     assert scenario.declared()["v2x"] == {**v2x, "tells": {"vehicle_2": ["place", "mass"]}}
     assert Scenario(**scenario.declared()) == scenario == scenario.replace(title=scenario.title)
     assert scenario != PAPER.replace(v2x={**v2x, "tells": ["mass"]})
-    assert scenario.v2x.drawn and PAPER.v2x.extensions == ()
+    assert scenario.v2x.drawn and PAPER.v2x.channel_keys == ()
 
 
 def test_given_worlds__have_messages_if_no_message_can_be_lost() -> None:

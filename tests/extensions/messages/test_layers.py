@@ -9,11 +9,11 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.layer import Layer
-from ethbrake_marl.motion.layout import SPEED
-from ethbrake_marl.worlds.channel import register_preset, register_v2x_extension
+from ethbrake_marl.motion.layout import FORCE, SPEED
+from ethbrake_marl.worlds.channel import register_preset, register_v2x_key
 from ethbrake_marl.worlds.physics import register_physics
 from tests.contract.interfaces import PAPER
-from tests.fixtures.layer import SamePhysics, UsersExtension
+from tests.fixtures.layer import SamePhysics, UsersKey
 from tests.refused import refused
 
 PPO = eb.Team.of({"vehicle_2": eb.make_agent("ppo", scenario="paper-random")}, "ppo")
@@ -46,17 +46,18 @@ class Faster(Layer):
 
 @pytest.fixture(autouse=True)
 def _registered() -> None:
-    mine = UsersExtension("mine", Mine())
+    mine = UsersKey("mine", Mine())
     extensions = {
         "mine": mine,
         "also_mine": mine,
-        "more": UsersExtension("more", Faster("more", 2.0, 1.0)),
-        "twice": UsersExtension("twice", Faster("twice", 0.0, 2.0)),
-        "early_twice": UsersExtension("early", Faster("early", 0.0, 2.0, stage=-1)),
-        "news": UsersExtension("messages", Mine()),
+        "more": UsersKey("more", Faster("more", 2.0, 1.0)),
+        "twice": UsersKey("twice", Faster("twice", 0.0, 2.0)),
+        "early_twice": UsersKey("early", Faster("early", 0.0, 2.0, stage=-1)),
+        "late": UsersKey("late", Faster("late", 2.0, 1.0, stage=2)),
+        "news": UsersKey("messages", Mine()),
     }
     for key, extension in extensions.items():
-        register_v2x_extension(key, extension)
+        register_v2x_key(key, extension)
     register_physics("sliding", SamePhysics())
 
 
@@ -69,7 +70,7 @@ def of_preset() -> eb.Scenario:
     return PAPER.replace(v2x={"preset": "frank", "news": 1})
 
 
-ACTS = "belong to different extensions, whose memories have the same name; leave one out"
+ACTS = "belong to different channel keys, whose memories have the same name; leave one out"
 REFUSED: dict[str, Callable[[], Any]] = {
     f"v2x: tells and news {ACTS}": lambda: changed({"tells": ["speed"], "news": 1}),
     f"v2x: tells and news {ACTS} ": of_preset,
@@ -80,11 +81,11 @@ REFUSED: dict[str, Callable[[], Any]] = {
         {"persistence": "periodic"}, physics="sliding"
     ),
     "v2x: is not known to physics: sliding; leave one": lambda: changed({"mine": 1}, physics="sliding"),
-    "key 'kept' of v2x: the name of its memory, 'shield', is in use; choose": lambda: register_v2x_extension(
-        "kept", UsersExtension("shield", Mine())
+    "key 'kept' of v2x: the name of its memory, 'shield', is in use; choose": lambda: register_v2x_key(
+        "kept", UsersKey("shield", Mine())
     ),
-    "key 'kept' of v2x: the name of its memory, 'physics', is in use": lambda: register_v2x_extension(
-        "kept", UsersExtension("physics", Mine())
+    "key 'kept' of v2x: the name of its memory, 'physics', is in use": lambda: register_v2x_key(
+        "kept", UsersKey("physics", Mine())
     ),
 }  # fmt: skip
 
@@ -121,6 +122,8 @@ def test_keys__of_all_extensions_act_together(v2x: dict[str, Any], infos: list[s
         ({"more": 1, "early_twice": 1}, 42.0),  # 20 * 2 + 2: the lower stage first
         ({"more": 1, "twice": 1, "persistence": "first"}, 44.0),  # messages report what was measured
         ({"more": 1, "twice": 1, "persistence": "periodic"}, 44.0),
+        ({"late": 1, "twice": 1, "persistence": "first"}, 42.0),  # a layer behind the messages
+        ({"late": 1, "twice": 1, "persistence": "periodic"}, 42.0),
     ],
     ids=str,
 )
@@ -137,6 +140,10 @@ def test_layers__compose_in_the_order_of_their_stages_each_with_its_memory(
         state, _ = game.step(state, np.zeros((2, 1)))
     assert game.seen(state, 2).speeds_mps[:, 0] == pytest.approx(seen_mps)
     assert state.speeds_mps[:, 0] == pytest.approx(20.0)
+    own = state.line.copy()
+    own[:, SPEED, 1:] = seen_mps
+    right = game.views[2].observe(state._replace(line=own), np.array([2]), scenario.time_step_s)[:, 0]
+    assert game.observe_alike(state, [2])[:, 0] == pytest.approx(right)
     for layer in game.layers:
         if isinstance(layer, Faster):
             assert state.memories[layer.name].tolist() == [3.0, 3.0]
@@ -161,7 +168,66 @@ def test_layer__that_fails_is_named(answer: Callable[[eb.State], Any]) -> None:
             call()
 
 
-def test_layers__are_not_replaced_without_a_word() -> None:
-    _, game = open_game("messages-noisy")
-    with pytest.raises(eb.EthBrakeError, match=r"has layers already \(ReportsLayer, MessagesLayer\)"):
-        game.with_layers([Mine()])
+class Late(Layer):
+    """A vehicle sees all others as they were two decisions (0.2 s) ago."""
+
+    def first_decision(self, game: Any, alert: eb.State, state: eb.State) -> eb.State:
+        return self._remember(state, [self._sight(game, state)] * 3)
+
+    def after(self, game: Any, before: eb.State, state: eb.State) -> eb.State:
+        return self._remember(state, [*np.moveaxis(before.memories["late"][:, 1:], 1, 0), self._sight(game, state)])
+
+    def seen(self, state: eb.State, body: int) -> eb.State:
+        line = state.memories["late"][:, 0, body].copy()
+        line[:, [SPEED, FORCE], body] = state.line[:, [SPEED, FORCE], body]  # of itself it knows the present
+        return state._replace(line=line)
+
+    def _sight(self, game: Any, state: eb.State) -> Any:
+        """What each vehicle sees now through the layers before, [n, N + 1, rows, N + 1]."""
+        return np.stack([game.seen(state, body, before=self).line for body in range(state.vehicles + 1)], axis=1)
+
+    def _remember(self, state: eb.State, sights: list[Any]) -> eb.State:
+        return state._replace(memories={**state.memories, "late": np.stack(sights, axis=1)})
+
+
+def test_a_late_sensor__composes_with_noisy_messages() -> None:
+    """The speed of Vehicle 1 that Vehicle 2 sees is the one that its messages said two decisions ago."""
+    scenario, noisy = open_game("messages-noisy")
+    late = noisy.with_layers([Late()])
+    assert [type(layer).__name__ for layer in late.layers] == ["ReportsLayer", "MessagesLayer", "Late"]
+    state, said, shown, own = late.reset(scenario.sample(5, 7)), list[Any](), list[Any](), list[Any]()
+    for _ in range(8):
+        said.append(noisy.seen(state, 2).speeds_mps[:, 0])
+        shown.append(late.seen(state, 2).speeds_mps[:, 0])
+        own.append(late.seen(state, 2).speeds_mps[:, 1] - state.speeds_mps[:, 1])
+        state, _ = late.step(state, np.full((5, 1), -0.4))
+    np.testing.assert_array_equal(shown, [said[0], said[0], *said[:-2]])
+    assert (np.diff(said, axis=0) != 0.0).any(axis=0).all() and not np.any(own)
+
+
+def test_layers__append_in_the_order_listed_whatever_their_stage() -> None:
+    """20 m/s seem (20 + 2) * 2 m/s, then 2 m/s more: also scripts and agents see the last layer."""
+    more, twice = Faster("more", 2.0, 1.0), Faster("twice", 0.0, 2.0, stage=-1)
+    scenario, plain = open_game(PAPER.replace(speeds_mps=[20.0, 20.0, 20.0], gaps_m=200.0))
+    looks = Looks()
+    game = plain._replace(scripts={3: looks}).with_layers([more, twice]).with_layers([Faster("more", 2.0, 1.0)])
+    worlds = scenario.sample(1, 7)
+    game.reset(worlds._replace(memories={"more": np.zeros(1), "twice": np.zeros(1)}))
+    assert [speed for _, speed in looks.speeds] == [46.0]
+    assert game.seen(worlds, 2).speeds_mps[0, 0] == 46.0
+
+
+class Looks:
+    """Keeps the speed of Vehicle 1 that it sees, and coasts."""
+
+    name = "looks"
+
+    def __init__(self) -> None:
+        self.speeds = list[tuple[int, float]]()
+
+    def begin(self, alert: eb.State, body: int) -> None:
+        return None
+
+    def act(self, state: eb.State, memory: None, body: int) -> Any:
+        self.speeds.append((body, float(state.speeds_mps[0, 0])))
+        return np.zeros(state.n), memory

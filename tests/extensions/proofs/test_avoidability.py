@@ -5,7 +5,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.evaluation.resimulation import advance_worlds
+from ethbrake_marl.evaluation.record import advance_worlds
 from ethbrake_marl.extensions.proofs.avoidability import PROVEN_FOR, avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.motion.digest import physics_digest

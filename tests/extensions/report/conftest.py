@@ -8,7 +8,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.episode.counts import HARM
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.measures import Measure
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.extensions.report.best_known import AVOIDABLE_COLUMN, BEST, UNAVOIDABLE
@@ -16,13 +16,13 @@ from ethbrake_marl.extensions.report.best_known import AVOIDABLE_COLUMN, BEST, U
 AGENTS = ("full_brake", "constant:4.5", "ppo", "ppo+episode")
 
 
-def compared_by(scenario: str | eb.Scenario, agents: object, episodes: int = 60, count: str = "first") -> Compared:
+def compared_by(scenario: str | eb.Scenario, agents: object, episodes: int = 60, count: str = "first") -> Comparison:
     loaded = eb.load_scenario(scenario)
     teams = teams_of(agents, loaded, harm_count=count)
-    return Compared.of(loaded, teams, episodes=episodes, seed=7, harm_count=count)
+    return Comparison.of(loaded, teams, episodes=episodes, seed=7, harm_count=count)
 
 
-def with_best_known(compared: Compared) -> Compared:
+def with_best_known(compared: Comparison) -> Comparison:
     """Result with invented best known harm: half of these agents' least harm; avoidable where that is 0."""
     result = compared.result
     least = {
@@ -41,10 +41,10 @@ def with_best_known(compared: Compared) -> Compared:
 
 
 @pytest.fixture(scope="session")
-def compared() -> Compared:
+def compared() -> Comparison:
     return compared_by("paper-random", AGENTS, 120)
 
 
 @pytest.fixture(scope="session")
-def searched(compared: Compared) -> Compared:
+def searched(compared: Comparison) -> Comparison:
     return with_best_known(compared)

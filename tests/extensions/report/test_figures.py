@@ -8,8 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.agent_names import teams_of
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import (
     BINS,
@@ -37,9 +36,7 @@ def legend(figure: Figure) -> list[str]:
 
 
 def record_of(world: int, agent: str, scenario: str = "paper-random") -> eb.EpisodeRecord:
-    loaded, game = eb.open_game(scenario)
-    (team,) = teams_of(agent, loaded).values()
-    return eb.record_episode(loaded.sample(1, 7, first=world), team, game)
+    return eb.record_episode(scenario, agent, number=world)
 
 
 # ---- all figures
@@ -91,7 +88,7 @@ def test_worlds_figure__shows_every_quantity_that_varies_and_three_worlds() -> N
 # ---- of an evaluation
 
 
-def test_harm_by_agent__bars_line_and_marks_are_the_means(searched: Compared) -> None:
+def test_harm_by_agent__bars_line_and_marks_are_the_means(searched: Comparison) -> None:
     other = compared_by("paper-random-obstacle", "coast,ppo,full_brake", 20)
     figure = harm_by_agent(searched, {"Other test": other})
     (axes,) = figure.axes
@@ -106,7 +103,7 @@ def test_harm_by_agent__bars_line_and_marks_are_the_means(searched: Compared) ->
     assert legend(figure) == ["best known", "other test"]
 
 
-def test_harm_above__shares_are_those_of_the_worlds(compared: Compared, searched: Compared) -> None:
+def test_harm_above__shares_are_those_of_the_worlds(compared: Comparison, searched: Comparison) -> None:
     for one, label in ((compared, "Harm"), (searched, "Regret")):
         axes = harm_above(one).axes[0]
         drawn, values = axes.lines[0], one.result["full_brake"]["first_impact_harm"]
@@ -116,7 +113,7 @@ def test_harm_above__shares_are_those_of_the_worlds(compared: Compared, searched
         assert axes.get_xlabel().startswith(label)
 
 
-def test_harm_against_total_gap__means_and_bands_are_those_of_the_groups(compared: Compared) -> None:
+def test_harm_against_total_gap__means_and_bands_are_those_of_the_groups(compared: Comparison) -> None:
     figure = harm_against_total_gap(compared.result)
     first, total = figure.axes
     gap = compared.result.worlds["gap_1_m"] + compared.result.worlds["gap_2_m"]
@@ -171,7 +168,7 @@ def test_curves__are_means_with_bands_and_lines() -> None:
 
 def test_trajectories__lines_and_impacts_are_those_of_the_record() -> None:
     record = record_of(0, "ppo")
-    figure = trajectories({"PPO": record})
+    figure = trajectories("paper-random", {"PPO": "ppo"})
     above, gaps, commands = figure.axes
     for i in range(3):
         assert above.lines[i].get_ydata().tolist() == record.positions_m[:, i].tolist()
@@ -193,7 +190,7 @@ def test_trajectories__lines_and_impacts_are_those_of_the_record() -> None:
 
 def test_trajectories__of_a_team_show_the_commands_of_each_learner_and_the_obstacle() -> None:
     record = record_of(0, "full_brake", "cooperation-4-all")
-    above, _, commands = trajectories({"a": record}).axes
+    above, _, commands = trajectories("cooperation-4-all", "full_brake").axes
     assert commands.get_ylabel() == "Command of\nVehicles 1, 2, 3 (m/s²)"
     obstacle = next(line for line in above.lines if line.get_label() == "obstacle")
     assert obstacle.get_ydata()[0] == record.initial.obstacle_gap_m[0]
@@ -220,7 +217,7 @@ def worlds_of(name: str, n: int) -> eb.State:
 @pytest.mark.parametrize(
     ("draw", "said"),
     [
-        (lambda: trajectories({}), "there are no records; give at least one"),
+        (lambda: trajectories("paper-random", {}), "agents = {}: must be names"),
         (lambda: picture_bytes(new_figure(1.0, 1.0), "a.jpg"), "must end in .png, .svg or .pdf"),
         (lambda: deceleration_figure(worlds_of("paper-random", 2), "paper-random"), "2 worlds, 1 learners, 0 scripts"),
         (lambda: deceleration_figure(worlds_of("cooperation-3-pair", 1), "cooperation-3-pair"), "1 worlds, 2 learners"),

@@ -11,12 +11,13 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.episode.counts import COLUMN
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.record import record_episodes
 from ethbrake_marl.extensions.report.best_known import UNAVOIDABLE
 from ethbrake_marl.extensions.report.episodes import (
     MOTION_SAMPLE_S,
     episode_data,
+    episodes_section,
     pieces_of,
     replaced_at_s,
     shown_worlds,
@@ -46,7 +47,7 @@ def player_data(html: str) -> Any:
 
 
 @pytest.fixture(scope="module")
-def html(compared: Compared) -> str:
+def html(compared: Comparison) -> str:
     other = OtherTest("Another test.", compared_by("paper-random-obstacle", AGENTS, 30))
     settings = {"Training seed": 5, "Command": "ethbrake run"}
     return ReportPage(
@@ -80,16 +81,29 @@ def test_first_sentence__of_the_honest_cost() -> None:
     )
 
 
+def test_first_sentence__compares_with_full_braking_wherever_it_stands_and_in_each_test() -> None:
+    agents = "coast,full_brake,ppo"
+    main, other = (compared_by(name, agents, 200) for name in ("paper-random", "paper-random-obstacle"))
+    means = [
+        [one.result[agent]["first_impact_harm"].mean() for agent in ("ppo", "full_brake")] for one in (main, other)
+    ]
+    (after, before), (there, braked) = means
+    assert first_sentence(main, "ppo", {"Obstacle test": other}) == (
+        f"ppo does {100 * (1 - after / before):.0f} % less harm than full braking (first impacts: {after:.2f} m²/s² per"
+        f" emergency instead of {before:.2f}), but more in the obstacle test ({there:.2f} instead of {braked:.2f})."
+    )
+
+
 def test_page__of_the_honest_cost_shows_it_beside_both_harms() -> None:
     page = Page(ReportPage("Mine", compared_by("paper-random", "full_brake,e_v2x_bm", 60, "honest"), "Short.", {}).html)
     assert "Honest cost of each agent" in page.text
     assert "First-impact harm Total harm Honest cost Push (m/s)" in page.text
 
 
-def test_first_sentence__flatters_nobody(compared: Compared) -> None:
+def test_first_sentence__flatters_nobody(compared: Comparison) -> None:
     def about(agents: str, **changes: Any) -> str:
         loaded = eb.load_scenario("paper-random").replace(**changes)
-        found = Compared.of(loaded, teams_of(agents, loaded), episodes=60, seed=7)
+        found = Comparison.of(loaded, teams_of(agents, loaded), episodes=60, seed=7)
         return first_sentence(found, agents.rpartition(",")[2], {})
 
     assert " % more harm than full braking (" in about("full_brake,coast")
@@ -110,7 +124,7 @@ def test_first_sentence__flatters_nobody(compared: Compared) -> None:
 # ---- the worlds that are shown
 
 
-def test_shown__begin_with_the_worst(compared: Compared, searched: Compared) -> None:
+def test_shown__begin_with_the_worst(compared: Comparison, searched: Comparison) -> None:
     harm, braking = (compared.result[agent]["first_impact_harm"] for agent in (FOCUS, "full_brake"))
     chosen = shown_worlds(compared, FOCUS)
     assert len(chosen) == 50 and len({*chosen.values()}) == 5
@@ -124,7 +138,7 @@ def test_shown__begin_with_the_worst(compared: Compared, searched: Compared) -> 
     assert avoidable and (searched.result[FOCUS]["avoidable"] & (harm > 0.0))[avoidable].all()
 
 
-def test_worlds__are_ranked_by_what_the_agents_minimise(compared: Compared, searched: Compared) -> None:
+def test_worlds__are_ranked_by_what_the_agents_minimise(compared: Comparison, searched: Comparison) -> None:
     honest, cost = compared._replace(harm_count="honest"), compared.result["ppo"]["honest_cost"]
     assert cost[worst_rows(honest, "ppo")].tolist() == sorted(cost, reverse=True)[:10]
     section = " ".join(map(str, worst_section(honest, "ppo", ()).body))
@@ -138,7 +152,7 @@ def test_worlds__are_ranked_by_what_the_agents_minimise(compared: Compared, sear
 @pytest.mark.parametrize("count", ["total", "honest"])
 @pytest.mark.parametrize("known", [False, True])
 def test_worlds__to_watch_are_those_of_the_cost_that_the_agents_minimise(
-    count: str, known: bool, compared: Compared, searched: Compared
+    count: str, known: bool, compared: Comparison, searched: Comparison
 ) -> None:
     """They are the worlds of the first-impact harm if this had the values of the cost."""
     mine = (searched if known else compared)._replace(harm_count=count)
@@ -153,14 +167,16 @@ def test_worlds__to_watch_are_those_of_the_cost_that_the_agents_minimise(
         assert chosen != shown_worlds(mine._replace(harm_count="first"), focus)
 
 
-def test_worst_worlds__can_be_watched(searched: Compared) -> None:
+def test_worst_worlds__can_be_watched(searched: Comparison) -> None:
     shown = worst_rows(searched, FOCUS).tolist()[:3]
     text = str(worst_section(searched, FOCUS, shown).body[1])
     assert text.count("data-watch") == 3 and text.count("avoidable") == 10
     assert f'data-watch="{shown[0]}"' in text and f"{searched.result[FOCUS]['total_harm'][shown[0]]:.2f}" in text
 
 
-def test_unavoidable__splits_the_worlds_only_if_somebody_has_proven_it(compared: Compared, searched: Compared) -> None:
+def test_unavoidable__splits_the_worlds_only_if_somebody_has_proven_it(
+    compared: Comparison, searched: Comparison
+) -> None:
     never = searched.result[FOCUS][UNAVOIDABLE]
     section = avoidable_section(searched)
     text = " ".join(map(str, section.body))
@@ -193,7 +209,7 @@ def test_tables__have_no_interval_that_takes_worlds_of_a_recording_for_independe
 # ---- the player
 
 
-def test_page__shows_fifty_worlds_whose_counts_are_those_of_the_evaluation(html: str, compared: Compared) -> None:
+def test_page__shows_fifty_worlds_whose_counts_are_those_of_the_evaluation(html: str, compared: Comparison) -> None:
     content = player_data(html)
     assert content["agents"] == [*AGENTS] and len(content["worlds"]) == 50 and content["shown"] == [0, 2, 3]
     for world in content["worlds"]:
@@ -258,13 +274,24 @@ def test_page__says_who_did_not_repeat_itself(html: str) -> None:
     assert re.search(r"In [1-5] worlds? of these, fickle drove differently", text) and "drove differently" not in html
 
 
+def test_episodes__are_compared_with_the_evaluation_in_both_counts(compared: Comparison) -> None:
+    columns = {
+        agent: {name: values.copy() for name, values in own.items()} for agent, own in compared.result.columns.items()
+    }
+    columns["ppo"]["total_harm"][3] += 1.0
+    columns["ppo"]["first_impact_harm"][5] += 1.0
+    changed = compared._replace(result=replace(compared.result, columns=columns))
+    text = " ".join(map(str, episodes_section(changed, "ppo", dict.fromkeys([3, 5, 7], "shown")).body))
+    assert "In 2 worlds of these, ppo drove differently" in text and text.count("drove differently") == 1
+
+
 # ---- the whole page
 
 
 EXTERNAL = re.compile(r"""(https?:)?//|@import|<(link|iframe|object|embed|base)\b""", re.IGNORECASE)
 
 
-def test_page__holds_everything_that_it_was_given_and_loads_nothing(html: str, compared: Compared) -> None:
+def test_page__holds_everything_that_it_was_given_and_loads_nothing(html: str, compared: Comparison) -> None:
     page = Page(html)
     for word in ("One million steps.", "Stopped early.", "Training seed 5", compared.table.parameters["worlds_sha256"]):
         assert word in page.text

@@ -8,12 +8,12 @@ from typing import get_args
 import pytest
 
 from ethbrake_marl import __version__
-from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.reproduction import curves, learning, strategies, tables
 from ethbrake_marl.extensions.reproduction.items import ITEMS
 from ethbrake_marl.extensions.reproduction.learning import Course
 from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.reproduction.random_test import NON_E, SHIPPED_SPECS, report_outcome
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED
 from ethbrake_marl.extensions.reproduction.verdicts import REASONS, Verdict, paper_texts
@@ -85,7 +85,7 @@ def test_sentences__are_judged_by_claims_that_the_code_makes_and_no_claim_is_lef
             module, "courses_of", lambda settings, delay: {"PPO": course} if delay == learning.DENSE else courses
         )
     for module in (curves, tables):
-        monkeypatch.setattr(module, "unconverged_policy", lambda folder: "ppo-obstacle")
+        monkeypatch.setattr(module, "unconverged_policy", lambda folder: "vine-paper")
     settings = ReproductionSettings(tmp_path, episodes=20)
     made = {f"{item.name}/{claim.name}" for item in ITEMS for claim in item.make(settings).claims}
     assert made == {sentence["result"] for sentence in SENTENCES}

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.extensions.report.figures import harm_against_total_gap
 from ethbrake_marl.extensions.report.page import drawing
 from ethbrake_marl.extensions.report.report import ReportPage
@@ -71,7 +71,7 @@ def wait_until(page: Any, condition: str) -> None:
 
 
 @pytest.fixture(scope="session")
-def report_file(compared: Compared, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report_file(compared: Comparison, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of ``compared``."""
     figure = drawing(harm_against_total_gap(compared.result), "Harm against the gap", "Mean harm by gap.")
     path = tmp_path_factory.mktemp("report") / "report.html"

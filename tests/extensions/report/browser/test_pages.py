@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-import ethbrake_marl as eb
-from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.extensions.report.report import ReportPage
 from tests.extensions.report.browser.conftest import wait_until
@@ -94,7 +93,7 @@ def counts(page: Any) -> list[tuple[int, float, float]]:
 
 
 def test_player__ends_with_the_ledger_in_fifty_worlds_and_counts_never_fall(
-    report_page: Any, compared: Compared
+    report_page: Any, compared: Comparison
 ) -> None:
     row_of = {int(number): row for row, number in enumerate(compared.result.worlds["world"])}
     for shown in ((0, 1, 2), (1, 2, 3)):
@@ -115,10 +114,9 @@ def test_player__ends_with_the_ledger_in_fifty_worlds_and_counts_never_fall(
             ]
 
 
-def test_player__places_are_those_of_the_recorded_episode(report_page: Any, compared: Compared) -> None:
-    number, (scenario, game) = report_page.evaluate(f"{PLAYER}.data.worlds[0].number"), eb.open_game("paper-random")
-    world = scenario.sample(1, 7, first=number)
-    record = record_episode(world, compared.teams["full_brake"], game, 0.005)
+def test_player__places_are_those_of_the_recorded_episode(report_page: Any, compared: Comparison) -> None:
+    number = report_page.evaluate(f"{PLAYER}.data.worlds[0].number")
+    record = record_episode("paper-random", compared.teams["full_brake"], number=number, sample_s=0.005)
     report_page.evaluate(f"{PLAYER}.shown = [0]; {PLAYER}.build()")
     for k in range(0, len(record.time_s), 27):
         state = report_page.evaluate(f"stateAt({PLAYER}.episodes()[0], {float(record.time_s[k])!r})")

@@ -67,12 +67,7 @@ def _check_measure(
     statistics: Iterable[Statistic] = (),
     watch: Callable[[Game, State], Watch | None] | None = None,
 ) -> Measure:
-    right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
-    if not isinstance(name, str) or re.fullmatch(right, name) is None:
-        raise InvalidInput(
-            f"measure {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter and not"
-            " ending in _ and a number, nor in _interval, _low, _high, _error or _freedom"
-        )
+    check_measure_name(name)
     function = watch if of is None else of
     if (of is None) == (watch is None) or not callable(function) or not (function.__doc__ or "").strip():
         raise InvalidInput(
@@ -82,6 +77,15 @@ def _check_measure(
     if name in (*DEFAULT_MEASURES, *RESERVED_NAMES) or name in TERMS:
         raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
     return Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(statistics), watch)
+
+
+def check_measure_name(name: object) -> None:
+    right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
+    if not isinstance(name, str) or re.fullmatch(right, name) is None:
+        raise InvalidInput(
+            f"measure {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter and not"
+            " ending in _ and a number, nor in _interval, _low, _high, _error or _freedom"
+        )
 
 
 DEFAULT_MEASURES = tuple(measure.name for measure in DEFAULT)
@@ -109,8 +113,8 @@ def split_names(names: str) -> list[str]:
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
     """Measures with these names, without duplicates: registered measures, summed terms of a reward, objectives.
 
-    ``FILE.py:NAME`` runs the file and takes its measure NAME. If the result contains another measure NAME, this one is
-    called ``FILE.py:NAME``. Raises ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
+    ``FILE.py:NAME`` runs the file and takes its measure NAME, which keeps this long name beside another NAME. Raises
+    ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
     """
     if not isinstance(names, Iterable):
         raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'pushed_mps,pushed_m'")
@@ -141,7 +145,7 @@ def _qualify_measure(name: str, measure: Measure) -> Measure:
 
 
 def _measures_named(name: str) -> list[Measure]:
-    """Measures that one name stands for; more than one if the name is an entry point with several measures."""
+    """Measures that one name stands for; several for an entry point with several."""
     if name in MEASURES and name in TERMS:
         raise AlreadyExists(f"measure {name!r}: a measure and a term of the reward have this name; rename one of them")
     if name in MEASURES:
@@ -162,8 +166,15 @@ def _measures_named(name: str) -> list[Measure]:
 
 
 def _of_file(file: str, name: str) -> Measure:
-    """Measure ``name`` of a user's Python file: a function, or a ``Part`` with arguments of ``register_measure``."""
+    """Measure ``name`` of a user's Python file: a function, or a ``Part`` with arguments of ``register_measure``.
+
+    It may be a function that the file itself registers under this name, also as a term of a reward.
+    """
     value = load_from_file(file, name)
+    if name in TERMS and TERMS[name].value is value:
+        return _sum_of_term(name, TERMS[name].value, TERMS[name].unit)
+    if name in MEASURES and value in (MEASURES[name].of, MEASURES[name].watch):
+        return MEASURES[name]
     part = value if isinstance(value, Part) else Part(value)
     try:
         measure = _check_measure(**signature(register_measure).bind(name, *part.arguments, **part.settings).arguments)
@@ -181,7 +192,7 @@ def _sum_of_term(name: str, term: TermFunction, unit: str) -> Measure:
 
 
 def _intervention(before: State, step: Step, after: State) -> Floats:
-    """Term ``intervention`` of the reward (``shields.shield``); 0 without a shield, so that tables can compare both."""
+    """The term ``intervention``; 0 without a shield, so that tables can compare both."""
     if "shield" not in after.memories:
         return np.zeros(after.speeds_mps.shape)
     return TERMS["intervention"].value(before, step, after)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from ethbrake_marl.agent_names import AGENTS
-from ethbrake_marl.evaluation.trial import COMPARED, WORLDS, try_scenario
+from ethbrake_marl.cli.trial import COMPARED, WORLDS, try_scenario
 from ethbrake_marl.worlds.catalogue import load_scenario
 
 PAPER = load_scenario("paper-random")

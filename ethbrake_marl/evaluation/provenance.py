@@ -11,22 +11,30 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.episode.departures import PLAIN_ROWS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.files.python_file import files_run
-from ethbrake_marl.motion.layout import PUSHED
+from ethbrake_marl.motion.layout import CAR_NAMES, FIRST, FORCE, GAP, HIT, IMPACTS, SPEED, TOTAL
 from ethbrake_marl.registry import versions_used
 
 EVALUATION_PACKAGES = ("ethbrake-marl", "numba", "numpy")
+# Rows of `line` with what vehicles do at the alert, in the order in which they are hashed
+MOTION = [SPEED, FORCE, GAP, HIT, FIRST, TOTAL, IMPACTS]
 KEYS_WITHOUT_EFFECT = ("name", "title", "description", "source")  # keys of a scenario that do not affect an episode
 
 
 def worlds_sha256(worlds: State) -> str:
-    """SHA-256 of worlds at the alert: of the arrays ``line`` (rows before PUSHED), ``car``, ``know`` and ``wanted``.
+    """SHA-256 of worlds at the alert: of the quantities ``MOTION`` and ``PLAIN_ROWS``, of ``know`` and of ``wanted``.
 
-    Numbers are hashed as little-endian 64-bit floats.
+    Numbers are little-endian floats. Another quantity of vehicles (row of ``car``) is hashed with its name, unless 0.
     """
-    digest = hashlib.sha256()
-    for array in (worlds.line[:, :PUSHED], worlds.car, worlds.know, worlds.wanted):
+    digest, arrays = hashlib.sha256(), [worlds.line[:, MOTION], worlds.car[:, PLAIN_ROWS], worlds.know, worlds.wanted]
+    for name in sorted(CAR_NAMES):
+        further = worlds.car[:, CAR_NAMES.index(name)]
+        if CAR_NAMES.index(name) not in PLAIN_ROWS and further.any():
+            digest.update(name.encode())
+            arrays.append(further)
+    for array in arrays:
         digest.update(f"{array.shape}".encode())
         digest.update(np.ascontiguousarray(array, "<f8").data)
     return digest.hexdigest()
@@ -41,18 +49,12 @@ def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Name -> version of Python and of every package that affects a result, including extensions.
-
-    Python files of the user that this process ran have their SHA-256 as version.
-    """
+    """Name -> version of Python and of every package that affects a result; of a user's Python file its SHA-256."""
     core_versions = {"python": platform.python_version()} | {name: version(name) for name in EVALUATION_PACKAGES}
     return core_versions | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 
 
 def policy_digests(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Vehicle -> SHA-256 of the manifest of its policy.
-
-    ``drivers``: vehicle number -> agent. Agents without a policy of this package are left out.
-    """
+    """Vehicle -> SHA-256 of the manifest of its policy, if it has one. ``drivers``: vehicle number -> agent."""
     manifests = {body: getattr(getattr(agent, "policy", None), "manifest", None) for body, agent in drivers.items()}
     return {f"vehicle_{body}": manifest.manifest_sha256 for body, manifest in manifests.items() if manifest is not None}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.evaluation.pushing import driving_s, first_impact_s
+from ethbrake_marl.evaluation.measures import driving_s, first_impact_s
 from tests.episode.lines import later, state_of
 from tests.episode.test_conduct import CLOSE, after_contact
 

@@ -7,15 +7,14 @@ from typing import Any, NamedTuple
 
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.evaluation.door import evaluate
-from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.evaluation.named_measures import split_names
+from ethbrake_marl.evaluation.evaluate import Result, evaluate
+from ethbrake_marl.evaluation.measure_registry import split_names
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.motion.layout import Ints
 from ethbrake_marl.worlds.scenario import Scenario
 
 
-class Compared(NamedTuple):
+class Comparison(NamedTuple):
     scenario: Scenario
     teams: Mapping[str, Team]
     result: Result
@@ -31,10 +30,9 @@ class Compared(NamedTuple):
         harm_count: str = "first",
         measures: Iterable[str] | str = (),
         **more: Any,
-    ) -> Compared:
-        """Evaluate the teams by ``evaluate(..., **more)``, and summarise the result.
-
-        For the count ``honest`` the measure ``pushed_mps`` is added.
+    ) -> Comparison:
+        """Evaluate the teams by ``evaluate(..., **more)``. For the count ``honest`` the measure ``pushed_mps`` is
+        added.
         """
         names = split_names(measures) if isinstance(measures, str) and measures else [*measures]
         if harm_count == "honest":
@@ -43,6 +41,5 @@ class Compared(NamedTuple):
         return cls(scenario, teams, result, summarise(result), harm_count)
 
     def worlds(self, rows: Iterable[int] | Ints) -> State:
-        """Worlds of the result with the indices ``rows``, at the alert."""
         numbers, seed = self.result.worlds["world"], self.result.about["seed"]
         return State.join([self.scenario.sample(1, seed, first=int(numbers[row])) for row in rows])
