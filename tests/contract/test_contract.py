@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
+from ethbrake_marl.episode.shaping import potential
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.stream import UnknownResetOption
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -148,6 +150,23 @@ def test_interfaces__agree_on_every_episode(scenario: Scenario, reward: str) -> 
     assert sum(turn.ended.sum() for turn in runs["single"]) >= 2
     assert any(turn.reward[0] != 0.0 for turn in runs["single"]) or scenario not in SCENARIOS.values()
     assert {name: bits(turns) for name, turns in runs.items()} == dict.fromkeys(BARE, bits(runs["single"]))
+
+
+@each_bare
+@pytest.mark.parametrize("action", [-1.0, -0.3, 0.5])
+def test_default_reward__adds_up_to_the_scaled_honest_cost_and_a_constant_of_the_world(
+    name: str, action: float
+) -> None:
+    game, interface, paid, given = open_game(PAPER, reward="honest")[1], BARE[name](PAPER, 1), 0.0, [[action]]
+    state = game.reset(PAPER.sample(4, seed=7).take([3]))
+    interface.reset(options={"listed_world": {"seed": 7, "number": 3}})
+    constant = -potential(game.settings, state)[0]
+    while not state.ended[0]:
+        state, _ = game.step(state, np.array(given))
+        turn = interface.step(np.array(given, np.float32))
+        paid += turn.reward[0]
+    assert turn.ended[0] and constant > 1.0
+    assert paid == pytest.approx(0.05 * (constant - state.harm("honest")[0]), abs=1e-4)
 
 
 def test_interfaces__agree_behind_the_shield_and_differ_from_the_bare_ones() -> None:

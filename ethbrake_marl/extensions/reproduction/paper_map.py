@@ -144,7 +144,10 @@ class PaperMap:
         counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
         if game.settings.weights[OF_PASSED:].any() or counted:
             what = f"the term {counted[0]}" if counted else "harm_count honest"
-            raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")
+            raise InvalidInput(
+                f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none; choose another"
+                " reward, such as harm"
+            )
         terms = tuple(
             (name, weight, partial(paper_collision, game.rewarding.params) if name == "collision" else function)
             for name, weight, function in game.rewarding.terms

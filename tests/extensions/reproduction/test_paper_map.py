@@ -145,7 +145,7 @@ def test_k_energy__of_each_pair_in_exact_physics() -> None:
 
 
 def test_observation__is_the_state_of_the_paper() -> None:
-    env = eb.EthBrakeEnv("paper-random-map")
+    env = eb.EthBrakeEnv("paper-random-map", reward="harm")
     observation, _ = env.reset(seed=7)
     assert observation.shape == (8,)
     assert env.unwrapped.game.views[2].names == (
@@ -205,7 +205,14 @@ def test_results__have_no_honest_cost() -> None:
 
 @pytest.mark.parametrize(
     ("reward", "message"),
-    [("honest", "harm_count honest needs exact impacts"), ({"harm": 1.0, "push": 1.0}, "the term push needs exact")],
+    [
+        (
+            "shaped",
+            "harm_count honest needs exact impacts, and physics: paper-map has none; choose another reward, such",
+        ),
+        ("honest", "harm_count honest needs exact impacts"),
+        ({"harm": 1.0, "push": 1.0}, "the term push needs exact"),
+    ],
 )
 def test_rewards__of_exact_impacts_are_refused(reward, message: str) -> None:
     with refused(message):
@@ -219,7 +226,7 @@ def test_record__is_refused() -> None:
 
 def test_watch__is_refused() -> None:
     with refused("a picture needs exact impacts"):
-        eb.EthBrakeEnv(MAPPED, render_mode="ansi").reset(seed=1)
+        eb.EthBrakeEnv(MAPPED, render_mode="ansi", reward="harm").reset(seed=1)
 
 
 def test_mixture__has_one_physics() -> None:
@@ -240,7 +247,7 @@ def test_honest_cost__of_exact_impacts_is_missing() -> None:
 
 
 def test_pictures__of_motion_between_samples_are_refused() -> None:
-    env = eb.EthBrakeEnv(MAPPED, render_mode="ansi")
+    env = eb.EthBrakeEnv(MAPPED, render_mode="ansi", reward="harm")
     with refused("a picture needs exact impacts"):
         env.reset(seed=7)
 
