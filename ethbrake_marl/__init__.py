@@ -78,6 +78,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.agent_names import register_agent as register_agent, register_shield as register_shield
     from ethbrake_marl.evaluation.measure_registry import register_measure as register_measure
     from ethbrake_marl.episode.terms import register_term as register_term
+    from ethbrake_marl.episode.counts import HarmCount as HarmCount, register_count as register_count
     from ethbrake_marl.training.recipe import register_algorithm as register_algorithm
     from ethbrake_marl.episode.objectives import register_objective as register_objective
     from ethbrake_marl.episode.features import (

@@ -21,6 +21,7 @@ from ethbrake_marl.agents.foreign import (
     features_of,
 )
 from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
+from ethbrake_marl.episode.counts import COUNTS, HarmCount
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
@@ -109,6 +110,13 @@ class LearnedAgent(RangeObserver):
     @property
     def training_range(self) -> TrainingRange | None:
         return self.policy.manifest.training_range
+
+    @property
+    def trained_for(self) -> HarmCount | None:
+        """Count of harm that the training minimised; None without harm in its reward, or for an unknown count."""
+        reward = self.policy.manifest.reward
+        name = reward.get("harm_count") if reward.get("harm") else None
+        return COUNTS[name] if isinstance(name, str) and name in COUNTS else None
 
     def observe(self, view: View, state: State, body: int) -> Observations:
         return observe_through(self.layers, view, state, body, self.policy.manifest.time_step_s)

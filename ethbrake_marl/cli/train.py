@@ -67,7 +67,7 @@ def train_command(
 ) -> None:
     """Train a policy, or the policies of several learners.
 
-    The recipe says what learners minimise: by default the honest cost; with --set rules=paper, first-impact harm.
+    The recipe says what learners minimise: by default the honest cost; with --set harm_count=first, first-impact harm.
     Writes the folder of the training run. At the end the command prints the harm of the trained agent and of full
     braking, the agent's name, and a command that evaluates the agent. Ctrl-C ends the training after the current update
     and saves the policy. `ethbrake train --resume FOLDER` continues the training; the final policy is then the same,
@@ -133,7 +133,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     ``scenario``: name or path of the scenario in the printed command; None: the name in the run's folder.
     """
     from ethbrake_marl.cli.settings import read_settings
-    from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
+    from ethbrake_marl.episode.counts import HONEST, IMPACT_COUNTS
     from ethbrake_marl.files.plain import read_object
     from ethbrake_marl.training.fixed_list import OBJECTIVE_METRIC, full_braking
 
@@ -144,9 +144,10 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
         Column("Total harm", "total_harm"),
         Column("Collisions", "collision_rate", digits=1, scale=100.0, unit=" %"),
     ]
-    if (count := plan.reward.harm_count) not in HARM:
-        columns.append(Column(IN_WORDS[count].capitalize(), COLUMN[count]))
-    measured = {"full_brake": full_braking(training)}
+    count, measured = plan.reward.harm_count, {"full_brake": full_braking(training)}
+    for shown in dict.fromkeys([HONEST, count]):
+        if shown not in IMPACT_COUNTS and shown.column in measured["full_brake"]:
+            columns.append(Column(shown.words.capitalize(), shown.column))
     measured[result.agent] = dict(result.metrics or {})
     if OBJECTIVE_METRIC in measured["full_brake"]:
         columns.append(Column("Relative to full braking" if training.scenario.lines else "Objective", OBJECTIVE_METRIC))
@@ -158,7 +159,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     table = Sheet("", columns, rows, note)
     settings = read_object(result.directory / "config.json").get("settings", ())
     options = [setting for setting in settings if read_settings([setting], [*type(plan).model_fields]).scenario]
-    options += {"first": [], "honest": ["rules=honest"]}.get(count, [f"harm_count={count}"])
+    options += [f"harm_count={count.name}"] * (count != HONEST)
     place = training.lines[0].scenario.name if training.scenario.lines else scenario or training.scenario.name
     words = ["--scenario", place, "--agents", f"full_brake,{result.agent}"]
     command = shlex.join(

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, pair_amount, weights_of
+from ethbrake_marl.episode.counts import AnyCount, HarmCount, amount_so_far, pair_amount
 from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.motion.compiling import kernel, large
@@ -151,15 +151,16 @@ def descend_worlds(inputs, shares, rounds, weights, best, least):
 
 
 def hold(
-    state: State, wanted: Floats, bodies: Sequence[int], trials: Floats, until_s: float | Floats, count: Count
+    state: State, wanted: Floats, bodies: Sequence[int], trials: Floats, until_s: float | Floats, harm_count: AnyCount
 ) -> Floats:
     """Harm if ``bodies`` hold constant commands until ``until_s`` (one time or [n]), [2, n, C] m2/s2.
 
-    The first row is the harm in ``count``, the second the harm in the count that breaks ties. ``trials`` [n, C, B] are
-    C sets of commands for the B bodies (m/s2); all other bodies hold ``wanted`` [n, N + 1] (m/s2).
+    The first row is the harm in ``harm_count``, the second the harm in the count that breaks ties. ``trials`` [n, C, B]
+    are C sets of commands for the B bodies (m/s2); all other bodies hold ``wanted`` [n, N + 1] (m/s2).
     """
-    out, weights = np.empty((2, *trials.shape[:2])), (weights_of(count), weights_of(other_count(count)))
-    hold_worlds(kernel_inputs(state, wanted, bodies, trials, until_s), *weights, out)
+    count, out = HarmCount.of(harm_count), np.empty((2, *trials.shape[:2]))
+    inputs = kernel_inputs(state, wanted, bodies, trials, until_s)
+    hold_worlds(inputs, count.weights, count.tie_breaker.weights, out)
     return out
 
 
@@ -169,7 +170,7 @@ def choose(
     bodies: Sequence[int] | Ints,
     trials: Floats,
     until_s: float | Floats,
-    count: Count,
+    count: HarmCount,
     below: Floats,
 ) -> tuple[Ints, Floats]:
     """Number of the first trial with the least harm, [n], and this harm, [n] m2/s2.
@@ -179,7 +180,7 @@ def choose(
     harm over these states counts.
     """
     best, least = np.zeros(len(below), np.int64), below.copy()
-    choose_worlds(kernel_inputs(state, wanted, bodies, trials, until_s), weights_of(count), best, least)
+    choose_worlds(kernel_inputs(state, wanted, bodies, trials, until_s), count.weights, best, least)
     return best, least
 
 
@@ -205,7 +206,7 @@ def memory_for(bodies: int) -> tuple[Floats, Floats, Floats]:
 
 
 def descend(
-    state: State, bodies: Sequence[int], shares: Floats, rounds: int, until_s: float | Floats, count: Count
+    state: State, bodies: Sequence[int], shares: Floats, rounds: int, until_s: float | Floats, count: HarmCount
 ) -> tuple[Floats, Floats]:
     """Choose a constant share of the brakes for each of ``bodies``, by coordinate descent; all others brake fully.
 
@@ -215,5 +216,5 @@ def descend(
     """
     commands, least = np.empty(state.wanted.shape), np.empty(state.n)
     inputs = kernel_inputs(state, commands, bodies, np.empty((1, len(shares), 1)), until_s)
-    descend_worlds(inputs, shares, rounds, weights_of(count), np.zeros(1, np.int64), least)
+    descend_worlds(inputs, shares, rounds, count.weights, np.zeros(1, np.int64), least)
     return commands, least

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import pair_amounts
+from ethbrake_marl.episode.counts import HarmCount, pair_amounts
 from ethbrake_marl.episode.functions import call_function, check_finite_values, description_of
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.state import State, require
@@ -158,19 +158,16 @@ def still_moving(before: State, step: Step, after: State) -> Floats:
     return 0.0 - step.out[TRUNCATED] * after.moving
 
 
-def growth(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
+def growth(objectives: Sequence[Objective], count: HarmCount, before: State, step: Step, after: State) -> Floats:
     """Term harm, [n, N]: minus the increase of the amount that each vehicle's objective minimises.
 
-    ``objectives`` has one per vehicle; ``count`` is the name of the count of harm (``episode.counts``).
+    ``objectives`` has one per vehicle.
     """
     return -amounts(objectives, before, after, count)
 
 
-def component(name: str, count: str) -> TermFunction:
-    """Function that computes the component ``harm_K``, ``pair_J_K`` or ``obstacle`` of a vector reward, [n].
-
-    ``count`` is the name of the count of harm.
-    """
+def component(name: str, count: HarmCount) -> TermFunction:
+    """Function that computes the component ``harm_K``, ``pair_J_K`` or ``obstacle`` of a vector reward, [n]."""
     if name == "obstacle":
         return partial(_of_pair, 0, count)
     last_vehicle = int(name.rpartition("_")[2])
@@ -179,15 +176,15 @@ def component(name: str, count: str) -> TermFunction:
     return partial(_of_pair, last_vehicle - 1, count)  # columns of pairs begin with the obstacle and Vehicle 1
 
 
-def _borne(vehicle: int, count: str, before: State, step: Step, after: State) -> Floats:
+def _borne(vehicle: int, count: HarmCount, before: State, step: Step, after: State) -> Floats:
     return 0.0 - Harm.of(_increase(count, before, after), after.car).borne[:, vehicle]
 
 
-def _of_pair(pair: int, count: str, before: State, step: Step, after: State) -> Floats:
+def _of_pair(pair: int, count: HarmCount, before: State, step: Step, after: State) -> Floats:
     return 0.0 - _increase(count, before, after)[0, :, pair]
 
 
-def _increase(count: str, before: State, after: State) -> Floats:
+def _increase(count: HarmCount, before: State, after: State) -> Floats:
     return pair_amounts(after.line, count) - pair_amounts(before.line, count)
 
 

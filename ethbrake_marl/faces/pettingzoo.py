@@ -61,7 +61,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         render_mode: a mode of ``metadata["render_modes"]``; None: no pictures.
         learners: names of the vehicles that learn; None: the scenario's.
         reward: ``shaped``, ``honest`` (minus the honest cost, without scale and potential), ``harm``, ``total-harm``,
-            ``paper``, a mapping of settings, or ``RewardParams``. Under ``harm`` pushing is free.
+            ``paper-reward``, a mapping of settings, or ``RewardParams``. Under ``harm`` pushing is free.
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
         max_cycles: number of steps after which an episode is truncated, as at a horizon; None: only at the horizon.

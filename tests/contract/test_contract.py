@@ -139,7 +139,7 @@ def test_clone__in_mid_episode_goes_on_alike_and_apart(name: str, scenario: Scen
 @pytest.mark.parametrize(
     ("scenario", "reward"),
     [
-        *((scenario, reward) for scenario in SCENARIOS.values() for reward in ("harm", "total-harm", "paper")),
+        *((scenario, reward) for scenario in SCENARIOS.values() for reward in ("harm", "total-harm", "paper-reward")),
         *((scenario, "harm") for scenario in LEVELS.values() if len(scenario.learners) == 1),
         *((line(2).with_learners([learner]), "harm") for learner in ("vehicle_1", "vehicle_2")),
     ],

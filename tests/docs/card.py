@@ -157,7 +157,7 @@ def page() -> str:
     env = eb.EthBrakeEnv()
     rewards = [
         [f"`{name}`", ", ".join(f"{weight:g} `{term}`" for term, weight in params.weights.items() if weight),
-         f"`{params.harm_count}`"]
+         f"`{params.harm_count.name}`"]
         for name, params in REWARDS.items()
     ]  # fmt: skip
     return TEXT.format(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agent_names import open_game
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import choose, descend, hold
 from ethbrake_marl.episode.play import price
@@ -23,7 +24,7 @@ REWARDS: dict[str, Any] = {
     "paper-random": "harm",
     "paper-random-obstacle": {"harm": 1.0, "harm_count": "total", "terminal": 1.0},
     "cooperation-3-pair": {"harm": 0.05, "shaping": 0.05, "jerk": 1e-4, "objective": "own"},
-    "paper-random-buildup": "paper",
+    "paper-random-buildup": "paper-reward",
     "realistic-mixed": "total-harm",
 }
 
@@ -156,7 +157,7 @@ def test_choose__is_the_first_trial_with_the_least_harm(name: str, count: str, s
     trials = -state.car[:, np.newaxis, BRAKING, bodies] * shares
     harm = hold(state, state.wanted, bodies, trials, state.clock[:, END], count)[0].reshape(n, states, -1).max(axis=1)
     for below in (np.full(n, np.inf), harm.min(axis=1), harm[:, 3], harm[:, 3] + 1e-9):
-        best, least = choose(state, state.wanted, bodies, trials, state.clock[:, END], count, below)
+        best, least = choose(state, state.wanted, bodies, trials, state.clock[:, END], HarmCount.of(count), below)
         expected = np.where(harm < below[:, np.newaxis], harm, below[:, np.newaxis])
         assert least.tolist() == expected.min(axis=1).tolist()
         assert best.tolist() == np.where(harm.min(axis=1) < below, harm.argmin(axis=1), 0).tolist()
@@ -166,10 +167,10 @@ def test_choose__is_the_first_trial_with_the_least_harm(name: str, count: str, s
 def test_descend__returns_the_commands_whose_harm_it_tells() -> None:
     scenario, game = open_game("cooperation-3-pair")
     state, shares, learners = scenario.sample(50, 3), np.linspace(0.0, 1.0, 5), game.settings.learners.tolist()
-    wanted, least = descend(state, learners, shares, 2, 8.0, "first")
+    wanted, least = descend(state, learners, shares, 2, 8.0, HarmCount.of("first"))
     found = hold(state, wanted, learners, wanted[:, np.newaxis, learners], 8.0, "first")[0, :, 0]
     assert found.tolist() == least.tolist()
-    alone = descend(state, learners[1:], shares, 1, 8.0, "first")[1]
+    alone = descend(state, learners[1:], shares, 1, 8.0, HarmCount.of("first"))[1]
     assert (least <= alone).all() and (least < alone - 1.0).any()
 
 

@@ -65,7 +65,7 @@ def test_step__of_three_vehicles_has_the_bits_of_the_text_for_any_number() -> No
         for _ in range(40):
             assert step_worlds(
                 line, clock, wanted, False, 0, N, line, car, clock, wanted, actions, scratch, out, reward,
-                settings.learners, settings.time_step_s, settings.harm, settings.terminal, settings.weights,
+                settings.learners, settings.time_step_s, settings.harm, settings.terminal, settings.harm_count.weights,
             ) == (-1, -1)  # fmt: skip
         return line, clock, wanted, out, reward
 

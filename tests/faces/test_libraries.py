@@ -45,7 +45,7 @@ from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 from ethbrake_marl.worlds.catalogue import load_scenario
 
 SETTINGS: list[dict[str, Any]] = [
-    {"scenario": "paper-random-obstacle", "agents": "learners"}, {"actions": 5, "reward": "paper"},
+    {"scenario": "paper-random-obstacle", "agents": "learners"}, {"actions": 5, "reward": "paper-reward"},
     {"scenario": "mixture-delays", "max_cycles": 7},
 ]  # fmt: skip
 
@@ -101,7 +101,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "content": {"scenario": {**CONTENT, "mass_t": np.array([1.0, 2.0, 3.0]), "gaps_m": {"choice": (7, np.float32(8))}}},
     "reward": {"reward": {"harm": np.float32(0.3), "jerk": np.float64(1e-5), "objective": ("own", "own", "own")}},
     "params": {"reward": RewardParams(harm=0.5, collision=0.1, k_energy=(1.0, 2.0))},
-    "names": {"reward": np.str_("paper"), "learners": np.array(["vehicle_3"])},
+    "names": {"reward": np.str_("paper-reward"), "learners": np.array(["vehicle_3"])},
     "view": {"observation": {"vehicle_2": View(["own", "rear_1.gap"])}, "learners": ("vehicle_2",)},
     "features": {"observation": ("own", "front_1")},
     "set": {"learners": {"vehicle_2"}, "render_mode": np.str_("ansi")},

@@ -75,7 +75,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
                 " must have one or more learners, which all observe the same features"
             )
         if shield is not None:
-            game = game._replace(shield=guard_team(NO_TEAM, shield, loaded, "first", {}).shield)
+            game = game._replace(shield=guard_team(NO_TEAM, shield, loaded, game.settings.harm_count, {}).shield)
         self.game = game
         self.stream = Stream(loaded, self.game, chosen_seed(seed))
         rows = n, len(self.learners)

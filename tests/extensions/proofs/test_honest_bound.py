@@ -192,7 +192,7 @@ def test_bound__of_a_plan_that_an_attacker_found():
         [0.258, 0.342], [21.623, 26.969, 24.376], [5.166, 6.106, 6.106], [0, 0, 0.626], drive=[0, 2.773, 0],
         mass=[11.38, 5.69, 4.173], limit=[60, 27.817, 60], restitution=0.5,
     )  # fmt: skip
-    bound = lower_bound(state, count="honest", horizon_s=12.0, time_step_s=0.1).harm[0]
+    bound = lower_bound(state, harm_count="honest", horizon_s=12.0, time_step_s=0.1).harm[0]
     game = eb.open_game(eb.load_scenario("paper-random").replace(horizon_s=12.0))[1]
     played = game.reset(with_braking(state, [1, 2, 3]))
     for command in [-6.106, 0.0, -6.106, -5.879, -1.376, -4.482, -4.978, -4.11, *[-6.106] * 112]:
@@ -241,11 +241,11 @@ def test_bound__is_near_the_best_known_cost_and_never_above_it(name):
     scenario = eb.load_scenario(name)
     worlds, steps = scenario.sample(30, seed=7), dict(horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
     best = BestHarmTable.load(TABLE_FOLDER / f"{name}.npz").harm["honest"][:30]
-    honest, total = (lower_bound(worlds, count=count, **steps) for count in ("honest", "total"))
+    honest, total = (lower_bound(worlds, harm_count=count, **steps) for count in ("honest", "total"))
     assert (honest.harm <= best + 1e-9).all() and honest.harm.mean() > LISTS[name][1] * best.mean()
     assert honest.harm[:6] == pytest.approx(LISTS[name][0], rel=1e-9)
     assert (honest.harm >= total.harm).all() and total.harm.mean() < 0.6 * best.mean()
-    any_time = [lower_bound(worlds, count=count, horizon_s=8.0).harm for count in ("honest", "total")]
+    any_time = [lower_bound(worlds, harm_count=count, horizon_s=8.0).harm for count in ("honest", "total")]
     assert np.array_equal(*any_time)
 
 
@@ -262,7 +262,7 @@ def test_condition__where_it_fails_the_bound_on_harm_remains(name):
     settings = dict(gaps=[7, 7], braking=[6, 7, 6], mass=[4.5, 5.5, 5.9], restitution=0.1) | CONDITIONS.get(name, {})
     gaps, braking = settings.pop("gaps"), settings.pop("braking")
     state = three(gaps, [18.0, 22.0, 22.0], braking, [0, 0, 0.3], drive=7.0, **settings)
-    honest, total = (lower_bound(state, count=count, time_step_s=0.1).harm[0] for count in ("honest", "total"))
+    honest, total = (lower_bound(state, harm_count=count, time_step_s=0.1).harm[0] for count in ("honest", "total"))
     assert honest > total + 1 if name == "covered" else honest == total
 
 
