@@ -68,7 +68,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "== Installing ethbrake_marl"
 	@$(INSTALL) -e ".[report]"
 	@echo "== Compiling the physics in the background"
-	@sh .ci/compile "$(CURDIR)/$(BIN)/ethbrake" & \
+	@sh .ci/compile "$(CURDIR)/$(BIN)/ethbrake" evaluate & \
 	compiling=$$!; \
 	trap "kill $$compiling" INT TERM; \
 	echo "== Installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX),: uv chooses the build for this machine)"; \
@@ -76,7 +76,7 @@ $(STAMP): pyproject.toml constraints.txt
 	echo "== Installing the packages for training and tests, at the versions of constraints.txt"; \
 	$(INSTALL) -e ".[train,dev]" || exit; \
 	! kill -0 $$compiling 2>/dev/null || echo "== Waiting for the physics to be compiled: a minute or more, only once"; \
-	wait $$compiling || \
+	wait $$compiling && sh .ci/compile "$(CURDIR)/$(BIN)/ethbrake" train || \
 	  echo "== Some of the physics could not be compiled (see above); commands compile it when they need it" >&2
 	@echo "== torch $$($(BIN)/python -c 'from importlib.metadata import version; print(version("torch"))')"
 	@$(BIN)/ethbrake evaluate --help >/dev/null

@@ -34,14 +34,12 @@ CASES = {  # gap (m), closing speed (m/s), closing acceleration (m/s2), how the 
 @in_our_style
 def draw_timeline(agent: str = "full_brake") -> Figure:
     """What each vehicle does in world 0 of paper-random, its impacts, and its speed."""
-    scenario, game = eb.open_game("paper-random")
-    worlds, team = scenario.sample(1, SEED), eb.Team.of({"vehicle_2": eb.make_agent(agent)}, agent)
-    record = eb.record_episode(worlds, team, game)
+    record = eb.record_episode("paper-random", agent, seed=SEED)
     figure = new_figure(8.0, 4.6)
     lanes, speeds = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 1.2))
     names: set[str] = set()
     for i in range(record.speeds_mps.shape[1]):
-        latency = float(worlds.latency_s[0, i])
+        latency = float(record.initial.latency_s[0, i])
         for start, end, phase in phases(record.time_s, record.speeds_mps[:, i], record.command_mps2[:, i], latency):
             label = "_" + phase if phase in names else phase
             names.add(phase)

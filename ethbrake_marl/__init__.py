@@ -118,7 +118,7 @@ def _import_public(name: str) -> Any:
         folder = f"{__name__}.extensions"
         if find_spec(folder) is not None and find_spec(f"{folder}.{name}") is not None:
             return import_module(f"{folder}.{name}")
-        close = get_close_matches(name, _HOMES, n=1)
+        close = ["parallel_env"] if name in ("make", "make_env") else get_close_matches(name, _HOMES, n=1)
         hint = f"did you mean {close[0]!r}?" if close else ""
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint and '; '}{hint}")
     register_environments()

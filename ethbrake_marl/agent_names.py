@@ -35,6 +35,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 AGENT_NAME_PATTERN = re.compile(r"[a-z][a-z0-9_-]*(\.[a-z0-9_-]+)*")
 IN_FILE = re.compile(r"(?P<file>.+?\.py):(?P<name>[A-Za-z_]\w*)(:(?P<argument>[^@]+))?(@(?P<policy>.+))?")
+MODEL_FILE = re.compile(r"[^:@]+\.(zip|pt|pth|onnx|safetensors)")
 PLAIN = re.compile(r"(?P<name>[^:@+]*)(:(?P<argument>[^@]*))?(@(?P<policy>.*))?")
 
 Driver = Agent | Team
@@ -133,11 +134,11 @@ WRAPPERS: Registry[AgentEntry] = Registry("shield or search", "shields", registe
 
 
 def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:
-    """Agent or team for a name such as ``"constant:3.5"`` or ``"ppo+step"`` (syntax: docstring of ``names``).
+    """Agent or team for a name such as ``"constant:3.5"`` or ``"ppo+step"`` (syntax: top of this file).
 
     Teams, wrappers and agents that look ahead need ``scenario``. ``harm_count``: harm that optimising agents minimise
-    (``episode.counts``). If the name contains a Python file, the file runs with all your rights. Raises ``UnknownName``
-    for an unknown name, and ``InvalidInput`` for a bad argument.
+    (``episode.counts``). A Python file in the name runs with all your rights. Raises ``UnknownName``, and
+    ``InvalidInput`` for a bad argument.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_agent("constant:3.5").name
@@ -159,7 +160,6 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
 
 
 def wrap_team(team: Team, wrapper: str, settings: AgentSettings) -> Team:
-    """Team with a ``wrapper`` around it: the name of a shield or search, such as ``episode:pairwise``."""
     entry, argument = _look_up(WRAPPERS, *wrapper.partition(":")[::2])
     result: Team = _call_maker(settings.spec, entry.make, team, argument, settings)
     return result._replace(name=settings.spec)
@@ -173,10 +173,10 @@ def team_of(driver: Driver, scenario: Scenario) -> Team:
 
 
 def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Team of each spec (the name of an agent, such as ``ppo+step``): spec -> team.
+    """Team of each spec: spec -> team. A group of agents is replaced by its specs.
 
-    ``specs``: a list, or a text with commas between specs. A group of agents is replaced by its specs. ``harm_count``:
-    as in ``make_agent``. Raises the errors of ``make_agent``, and ``InvalidInput`` for a repeated spec.
+    ``specs``: a list, or a text with commas. Raises the errors of ``make_agent``, and ``InvalidInput`` for a repeated
+    spec.
     """
     teams: dict[str, Team] = {}
     for name in split_specs(specs) if isinstance(specs, str) else specs:
@@ -191,8 +191,7 @@ def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> d
     """Teams for any description of agents: name -> team.
 
     ``agents`` is a text or list as in ``make_teams``; or a mapping from names to specs, agents, teams, or mappings from
-    vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``. Raises ``InvalidInput`` for
-    anything else. ``harm_count``: as in ``make_agent``.
+    vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``.
     """
     if isinstance(agents, str) or (isinstance(agents, Iterable) and not isinstance(agents, Mapping)):
         return make_teams(agents, scenario, harm_count=harm_count)
@@ -241,7 +240,6 @@ def split_specs(text: str) -> list[str]:
 
 
 def check_path(path: str | os.PathLike[str]) -> None:
-    """Raise ``InvalidInput`` for a path with a comma or plus, which cannot stand in the name of an agent."""
     if {",", "+"} & {*str(path)}:
         raise InvalidInput(
             f"{path}: a path in the name of an agent must have no comma and no plus; rename it, or make a link to it"
@@ -250,6 +248,11 @@ def check_path(path: str | os.PathLike[str]) -> None:
 
 def _make(core: str, settings: AgentSettings) -> Driver:
     """Agent or team for a spec without wrappers."""
+    if MODEL_FILE.fullmatch(core):
+        raise InvalidInput(
+            f"agent {core!r}: is a file; load it: {{'mine': eb.policy_agent(MODEL)}}, where MODEL is PPO.load({core!r})"
+            " or another loaded model; on the command line FILE.py:FUNCTION, a function that returns this agent"
+        )
     in_file = IN_FILE.fullmatch(core)
     match = in_file or PLAIN.fullmatch(core)
     if match is None:
@@ -277,8 +280,7 @@ def _look_up(
 ) -> tuple[AgentEntry, str | None]:
     """Entry of a table for a name with this argument, and the argument to pass to the entry's ``make``.
 
-    With a policy's path, a name that is no agent is taken for the algorithm that trained the policy. Raises
-    ``UnknownName``, and ``InvalidInput`` for an argument or path that the entry does not take.
+    With a policy's path, a name that is no agent is taken for the algorithm that trained the policy.
     """
     rest, _, last = argument.rpartition(":")
     if argument and f"{name}.{last}" in table:
@@ -296,7 +298,6 @@ def _look_up(
 
 
 def _in_file(match: re.Match[str], settings: AgentSettings) -> Callable[..., Any]:
-    """Function of a user's Python file that makes an agent, as a function of argument and settings."""
     function = load_from_file(match["file"], match["name"], reads=settings.policy)
     if not callable(function):
         raise InvalidInput(
@@ -314,7 +315,6 @@ def _in_file(match: re.Match[str], settings: AgentSettings) -> Callable[..., Any
 
 
 def _call_maker(spec: str, make: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a user's function that makes an agent or team; an error of the user's code becomes an ``InvalidInput``."""
     try:
         return make(*arguments)
     except EthBrakeError:
@@ -353,10 +353,7 @@ def require_learner(scenario: Scenario) -> None:
 
 
 def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
-    """Agents of the vehicles whose role is the name of an agent, by the vehicle's number (1: Vehicle 1).
-
-    Raises ``InvalidInput`` for a role that is unknown, or that names a team.
-    """
+    """Agents of the vehicles whose role is the name of an agent, by the vehicle's number (1: Vehicle 1)."""
     scripts = {}
     for body, (vehicle, role) in enumerate(scenario.roles.items(), 1):
         if role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):
@@ -377,7 +374,7 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
 
 
 def listed_agents() -> list[AgentEntry]:
-    """Entries of all agents and wrappers that can be loaded, without groups. A wrapper's ``form`` begins with ``+``."""
+    """Entries of all agents and wrappers that can be loaded, without groups."""
     agents = [entry for entry in AGENTS.usable().values() if callable(entry.make)]
     return agents + [replace(entry, form=f"+{entry.form}") for entry in WRAPPERS.usable().values()]
 

@@ -117,7 +117,7 @@ EXTRA_OF = {
     **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
     **dict.fromkeys(("matplotlib", "jinja2", "markupsafe"), "report"),
     **dict.fromkeys(("benchmarl", "torchrl", "tensordict", "hydra"), "marl"),
-    **dict.fromkeys(("onnx", "onnxruntime"), "export"),
+    "onnx": "export",
     **dict.fromkeys(("pandas", "pyarrow"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("ray", "joblib"), "cluster"),
@@ -211,6 +211,10 @@ class Unfamiliar(UserWarning):
 
 class CacheFault(UserWarning):
     """The cache of compiled physics code is damaged, or cannot be written, so code is compiled again."""
+
+
+class NoLocks(UserWarning):
+    """The file system of a folder has no locks, so nothing stops a second process from working in the folder."""
 
 
 class IgnoredName(UserWarning):

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import redirect_stdout
 from functools import cache
 from itertools import islice
+from multiprocessing import resource_tracker
 from typing import Any
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, check_whole_number, naming_extras
@@ -93,11 +94,19 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
         parallel = Parallel(jobs, batch_size=1, return_as="generator" if streams else "list")
     first = [_pickle_call(call) for call in PREPARATIONS.values()]
     work = (delayed(_answer)(os.getpid(), share, first, _pickle_call(call)) for call in calls)
+    is_blocked = streams and hasattr(signal, "pthread_sigmask")
     batches = [work] if streams else iter(lambda: list(islice(work, PER_PROCESS * jobs)), [])
     for batch in batches:
         results: Any = ()
         try:
-            results = parallel(batch)
+            if is_blocked:  # processes that start inherit the block, until they ignore Ctrl-C
+                resource_tracker.ensure_running()  # it starts with the signal unblocked, and would unblock it here, too
+                signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                results = parallel(batch)
+            finally:
+                if is_blocked:
+                    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             for result in results:  # noqa: UP028  # `yield from` would close `results` outside the clause below
                 yield result
         except BrokenProcessPool:

@@ -132,8 +132,7 @@ def measure(folder: Path) -> list[eb.SummaryRow]:
     policies: list[eb.Policy] = [eb.load_policy(folder), eb.load_shipped("ppo")]
     agents = {"full_brake": "full_brake", "learned": eb.LearnedAgent(policies[0]), "ppo": eb.make_agent("ppo")}
     found: eb.Result = eb.evaluate(worlds, agents, scenario=scenario, measures="pushed_mps,pushed_m")
-    _, game = eb.open_game(scenario)
-    record: eb.EpisodeRecord = eb.record_episode(worlds, eb.Team.of({"vehicle_2": Cautious()}, "cautious"), game)
+    record: eb.EpisodeRecord = eb.record_episode(worlds, Cautious(), scenario=scenario)
     assert record.last.harm("first").shape == found["learned"]["first_impact_harm"].shape
     return eb.summarise(found)
 

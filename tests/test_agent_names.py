@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl import names
+from ethbrake_marl import agent_names
 from ethbrake_marl.agent_names import (
     AgentSettings,
     group,
@@ -53,7 +53,7 @@ number = 3
 
 @pytest.fixture(autouse=True)
 def _own_tables(monkeypatch: pytest.MonkeyPatch) -> None:
-    for table in (names.AGENTS, names.WRAPPERS):
+    for table in (agent_names.AGENTS, agent_names.WRAPPERS):
         monkeypatch.setattr(table, "loaded", dict(table.loaded))
 
 
@@ -89,6 +89,7 @@ def test_a_script__has_the_name_that_it_was_asked_for_by(spec: str):
         (None, "must be a name"),
         ("a@", "a path must follow '@'"),
         ("a b", "unknown agent 'a b'"),
+        ("runs/mine.zip", "agent 'runs/mine.zip': is a file; load it: "),
         ("A", "unknown agent 'A'"),
     ],
 )

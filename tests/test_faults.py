@@ -146,6 +146,6 @@ def test_observations__of_a_model_are_those_it_was_trained_with(tmp_path: Path) 
     "closed", [">&- 2>&-", *(pytest.param(each, marks=pytest.mark.slow) for each in (">&-", "2>&-"))]
 )
 def test_command__whose_streams_are_closed_does_its_work(closed: str, tmp_path: Path) -> None:
-    command = f"{sys.executable} -m ethbrake_marl evaluate --episodes 2 --output '{tmp_path}/out' {closed}"
+    command = f"'{sys.executable}' -m ethbrake_marl evaluate --episodes 2 --output '{tmp_path}/out' {closed}"
     assert subprocess.run(command, shell=True, check=False, timeout=300).returncode == 0
     assert (tmp_path / "out/results.json").exists()

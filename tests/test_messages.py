@@ -94,6 +94,11 @@ def test_unknown_name__of_something_else_or_with_two_neighbours(call: Any, messa
         call()
 
 
+def test_make_env__is_called_parallel_env() -> None:
+    with pytest.raises(AttributeError, match="did you mean 'parallel_env'"):
+        eb.make_env  # noqa: B018
+
+
 USERS_FILE = """\
 import json
 from pathlib import Path

@@ -1,11 +1,9 @@
 """Independent calls: one at a time, in processes, and where joblib's configuration says."""
 
 import os
-import signal
 
 import pytest
 
-from ethbrake_marl import parallel
 from ethbrake_marl.parallel import WorkerLost, run_each
 
 
@@ -29,6 +27,7 @@ def test_process__that_is_killed_is_an_error_and_each_has_one_thread() -> None:
         list(run_each([(os._exit, 3)], 2))
 
 
+
 @pytest.mark.parametrize(("cores", "jobs", "processes", "share"), [(5, 2, 2, 2), (3, 8, 3, 1), (2, 2, 2, 1)])
 def test_processes_and_their_threads__are_never_more_than_the_cores(
     cores: int, jobs: int, processes: int, share: int, monkeypatch: pytest.MonkeyPatch
@@ -44,12 +43,3 @@ def test_processes_and_their_threads__are_never_more_than_the_cores(
     monkeypatch.setattr(parallel, "usable_cores", lambda: cores)
     assert [*run_each(((parallel.chosen_threads, 64) for _ in range(3)), jobs)] == [share] * 3
     assert sizes == [processes]
-
-
-def test_interrupt__is_blocked_where_the_system_can(monkeypatch: pytest.MonkeyPatch) -> None:
-    with parallel._blocked_interrupt():
-        assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    monkeypatch.delattr(signal, "pthread_sigmask")
-    with parallel._blocked_interrupt():
-        pass  # no error: there is nothing to block

@@ -25,10 +25,7 @@ SCENARIO, WORLDS, SEED = "cooperation-2-paper", 1000, 7
 PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
 POLICY = "ppo"
 ALONE = ("full_brake", POLICY)  # agents that have no variant ``estimated``
-LIMITS = {  # agent that decides on received messages -> the same agent that knows the line exactly
-    "e_v2x_bm:estimated": "e_v2x_bm",
-    f"{POLICY}+step:estimated": f"{POLICY}+step",
-}
+LIMITS = {f"{POLICY}+step:estimated": f"{POLICY}+step"}  # shield that decides on messages -> one that knows the line
 COUNTS = {"first": "first_impact_harm", "total": "total_harm"}
 CAPTION = (
     f"{SCENARIO} over each channel: {WORLDS:,} worlds of the list of seed {SEED}. Harm of the agent that decides on"

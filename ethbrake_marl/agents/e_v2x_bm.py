@@ -1,8 +1,7 @@
 """E-V2X-BM: brakes with the constant deceleration that does the least harm, chosen at the alert.
 
-``pairwise`` is the paper's closed form. ``coupled`` simulates the whole line with the physics of the episode. The
-simulation includes what the closed form leaves out (changes of speed, later impacts, lasting contact), so it predicts
-the harm that happens.
+``pairwise`` is the paper's closed form. ``coupled`` simulates the whole line with the physics of the episode, so it
+predicts the harm that happens.
 """
 
 from __future__ import annotations
@@ -35,11 +34,10 @@ TIE_MARGIN = 1e-9  # harms (m2/s2) closer than this count as equal
 def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Floats = 8.0) -> ConstantDeceleration:
     """Constant deceleration of vehicle ``body`` that does the least simulated harm, and this harm, in every world.
 
-    All other vehicles hold their commands ``alert.wanted`` [n, N + 1] (m/s2). ``count``: harm to minimise
-    (``episode.counts``). ``horizon_s``: time until which harm counts, one number or [n]. If the deceleration of the
-    closed form does no harm, it is the result. Among decelerations of equal harm, the harm in a second count decides
-    (``counts.other_count``); then the middle one is the result. Harm has kinks and jumps as a function of the
-    deceleration, so a deceleration between two samples of the search may do less harm.
+    All other vehicles hold ``alert.wanted``. ``count``: harm to minimise (``episode.counts``). ``horizon_s``: time
+    until which harm counts, one number or [n]. Ties: the closed form's deceleration if it does no harm; then the harm
+    in a second count (``counts.other_count``); then the middle one. Harm has kinks and jumps, so a deceleration between
+    two samples may do less.
     """
     until_s = np.full(alert.n, horizon_s, np.float64)
     braking = np.maximum(-alert.wanted, 0.0)
@@ -56,10 +54,9 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
 
 
 def harms(alert: State, body: int, decelerations: Floats, count: str, until_s: Floats) -> Floats:
-    """Harm if vehicle ``body`` holds each of C decelerations, [2, n, C] m2/s2.
+    """Harm if vehicle ``body`` holds each of C ``decelerations`` [n, C] (m/s2), [2, n, C] m2/s2.
 
-    Row 0 is the harm in ``count``, row 1 the harm in the count that breaks ties. ``decelerations`` [n, C] (m/s2) may
-    differ between worlds. Harm counts until ``until_s`` [n] (s after the alert).
+    Row 0 is the harm in ``count``, row 1 the harm in the count that breaks ties.
     """
     return hold(alert, alert.wanted, [body], -decelerations[:, :, np.newaxis], until_s, count)
 
@@ -67,9 +64,9 @@ def harms(alert: State, body: int, decelerations: Floats, count: str, until_s: F
 def search_deceleration(alert: State, body: int, count: str, until_s: Floats) -> Floats:
     """Best constant deceleration of vehicle ``body`` (m/s2), with its harm as in ``harms`` (m2/s2), [n, 3].
 
-    The search divides the range of decelerations into ``FIRST_PARTS`` equal cells, and then, again and again, every
-    cell that may contain a better deceleration. Rounding cannot carry the result across a jump of the harm, unless the
-    jump is within rounding of an end of one of the first cells.
+    Divides the range into ``FIRST_PARTS`` cells, then again and again every cell that may contain a better
+    deceleration. Rounding cannot carry the result across a jump of the harm, unless the jump is within rounding of an
+    end of a first cell.
     """
     best = np.full((alert.n, 3), np.inf)
     rows, step = np.arange(alert.n), alert.braking_capacity_mps2[:, body - 1] / FIRST_PARTS
@@ -92,10 +89,9 @@ def find_cells(rows, at, harm, step, best, cells):
 
     A cell is the interval between two neighbouring samples. It may contain a better deceleration if the smaller harm at
     its ends, minus the largest change of harm in this cell and its two neighbours, is below the best harm. Row j of
-    ``at`` [m, C] (m/s2) and ``harm`` [2, m, C] (m2/s2) has the C samples of the world ``rows[j]``; they are
-    ``step[rows[j]]`` m/s2 apart. ``best`` [n, 3]: best decelerations so far, with their harm in both counts. ``cells``
-    [2, .] receives two numbers for each cell that may contain a better deceleration: j, and the number of the cell in
-    row j.
+    ``at`` [m, C] (m/s2) and ``harm`` [2, m, C] (m2/s2) has the samples of the world ``rows[j]``, ``step[rows[j]]`` m/s2
+    apart. ``best`` [n, 3]: as in ``search_deceleration``. ``cells`` [2, .] receives j and the number of the cell in row
+    j.
     """
     count, last = 0, at.shape[1] - 1
     for j in range(at.shape[0]):
@@ -120,10 +116,8 @@ def find_cells(rows, at, harm, step, best, cells):
 
 @kernel
 def take_middle(at, harm, best_so_far):
-    """Set ``best_so_far[0]`` to the middle one of the decelerations ``at`` [C] whose harm equals ``best_so_far[1:]``.
-
-    ``harm`` [2, C]: harm of the decelerations in both counts. ``best_so_far`` [3]: best deceleration (m/s2) and its
-    harm.
+    """Set ``best_so_far[0]`` to the middle one of the decelerations ``at`` [C] whose ``harm`` [2, C] equals
+    ``best_so_far[1:]``.
     """
     ties = 0
     for c in range(len(at)):
@@ -159,13 +153,8 @@ class Predicting:
 class EV2XBM(Predicting):
     """Brakes with the deceleration of ``coupled``, assuming that the other learners brake fully.
 
-    If they do, the predicted harm is, to the last bit, the harm of the episode.
-
-    Args:
-        settings: settings of the episodes (``Game.settings``).
-        agents: vehicle (1: Vehicle 1) -> role, for vehicles driven by agents whose commands are not known at the alert.
-        count: harm to minimise: ``first``, ``total`` or ``honest`` (``episode.counts``).
-
+    If they do, the predicted harm is, to the last bit, the harm of the episode. ``agents``: vehicle (1: Vehicle 1) ->
+    role, for vehicles whose commands are not known at the alert.
     """
 
     name, knows = "e_v2x_bm", MODEL
@@ -176,9 +165,8 @@ class EV2XBM(Predicting):
         self.settings, self.agents, self.count = settings, dict(agents), count
 
     def begin(self, alert: State, body: int) -> BaselineMemory:
-        """Command for the whole episode, and its predicted harm.
-
-        Raises ``InvalidInput`` if ``agents`` contains a vehicle other than ``body``.
+        """Command for the whole episode, and its predicted harm. Raises ``InvalidInput`` if another vehicle is in
+        ``agents``.
         """
         for vehicle, role in self.agents.items():
             if vehicle != body:

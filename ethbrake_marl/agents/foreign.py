@@ -30,10 +30,10 @@ WRAPPED_ATTRIBUTES = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  
 
 
 def ask_of(policy: Any, who: str) -> Ask:
-    """Function ``(policy, observations) -> actions`` that calls a policy of this kind. The policy has no memory.
+    """Function that calls a policy of this kind.
 
-    Raises ``InvalidInput``, with a message that begins with ``who``, for an unknown kind of policy, and for a model
-    whose actions would be random or depend on the rest of the batch.
+    Raises ``InvalidInput``, beginning with ``who``, for an unknown kind, and for a model whose actions would be random
+    or depend on the rest of the batch.
     """
     if hasattr(policy, "predict"):
         return ask_model
@@ -54,9 +54,9 @@ def ask_function(function: Any, observations: Observations) -> Any:
 
 
 def ask_model(model: Any, observations: Observations) -> Any:
-    """Deterministic actions of an object with ``predict``; the ``VecNormalize`` of its training is applied.
+    """Deterministic actions of an object with ``predict``, under the ``VecNormalize`` of its training.
 
-    Raises ``InvalidInput`` if the model also returns a state.
+    Raises ``InvalidInput`` for a model with a memory.
     """
     statistics = statistics_of(model)
     answer = model.predict(
@@ -83,7 +83,6 @@ def ask_torch(module: Any, observations: Observations) -> Any:
 
 
 def _refuse_training_mode(module: Any, who: str) -> None:
-    """Raise ``InvalidInput`` if a layer of a torch module is in training mode and this affects its results."""
     for layer in module.modules():
         shares = [getattr(layer, name, None) for name in ("p", "dropout")]
         random = any(isinstance(share, float | int) and share > 0.0 for share in shares)
@@ -102,8 +101,8 @@ def features_of(policy: Any) -> tuple[str, ...] | None:
 def count_of_actions(policy: Any, count: int | None, who: str) -> int | None:
     """Number of discrete actions of a policy; None if it returns numbers in [-1, 1].
 
-    ``count``: the number that the user states, or None. Raises ``InvalidInput``, with a message that begins with
-    ``who``, if the policy's action space is neither ``count`` indices nor, without ``count``, a box from -1 to 1.
+    ``count``: as the user states. Raises ``InvalidInput``, beginning with ``who``, for an action space that does not
+    fit.
     """
     space: Any = getattr(policy, "action_space", None)
     if count is None and getattr(space, "evenly_spaced", False):  # of an environment of this package
@@ -128,9 +127,9 @@ def statistics_of(model: Any) -> Any:
 
 
 def check_wrappers(policy: Any, who: str) -> None:
-    """Raise ``InvalidInput`` if a model was trained under a wrapper that may change observations or actions.
+    """Raise ``InvalidInput`` for a model that was trained under a wrapper which may change observations or actions.
 
-    Also raised if a model was trained under ``VecNormalize`` and the statistics of ``VecNormalize`` are missing.
+    Also raised if the statistics of its ``VecNormalize`` are missing.
     """
     env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
     for layer in [] if env is None else wrappers_of(env):
@@ -162,8 +161,8 @@ def wrappers_of(env: Any) -> Iterator[Any]:
 def _was_normalised(model: Any) -> bool:
     """Whether a model was trained on normalised observations.
 
-    The last observation in training is then outside the model's observation space, or the model also stores the
-    original observation. Off-policy algorithms always store it, so it says nothing about them.
+    Then its last observation is outside its observation space, or it also stores the original observation, which
+    off-policy algorithms always do.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

@@ -38,10 +38,8 @@ class ConstantDeceleration(NamedTuple):
 
 @kernel
 def braking_now(speed, braking, onset, now):
-    """Acceleration (m/s2) of a vehicle at time ``now`` (s), and how long this acceleration lasts from then on (s).
-
-    The vehicle has the speed ``speed`` (m/s) now. It coasts until ``onset`` (s), then brakes to rest with ``braking``
-    (m/s2).
+    """Acceleration (m/s2) at time ``now`` (s), and how long it lasts (s), of a vehicle that coasts until ``onset`` (s),
+    then brakes to rest.
     """
     if now < onset:
         return 0.0, onset - now
@@ -54,11 +52,9 @@ def braking_now(speed, braking, onset, now):
 def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset, until):
     """Move a pair to its first impact, or to ``until`` (s); return its harm (m2/s2), the gap (m) and both speeds (m/s).
 
-    ``front`` and ``rear`` are the vehicles' speeds (m/s), ``front_braking`` and ``rear_braking`` their decelerations
-    (m/s2). Each vehicle coasts until its onset (s), then brakes to rest. So the motion has phases of constant
-    acceleration: both coast, one brakes, both brake, one stands (regimes A to C of the proof); the function looks for a
-    contact in each phase. A contact without a closing speed is no impact. If after such a contact the rear vehicle
-    brakes less than the front vehicle, the two stay in contact, and the harm is 0.
+    Each vehicle coasts until its onset (s), then brakes to rest (m/s2): phases of constant acceleration, regimes A to C
+    of the proof. A contact without a closing speed is no impact; if the rear vehicle then brakes less than the front
+    vehicle, the two stay in contact, and the harm is 0.
     """
     now = 0.0
     while now < until:
@@ -82,9 +78,8 @@ def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset,
 
 @large
 def harm_of_deceleration(line, braking, wait, body, a):
-    """Harm H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2).
-
-    The other arguments are those of ``choose_decelerations`` for one world.
+    """Harm H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2). Other arguments:
+    ``choose_decelerations``.
     """
     gap, speed, harm = line[GAP], line[SPEED], 0.0
     if body > 1:
@@ -100,10 +95,9 @@ def harm_of_deceleration(line, braking, wait, body, a):
 def find_candidates(line, braking, wait, body, at):
     """Write to ``at`` [C] the decelerations (m/s2) of vehicle ``body`` where H may be least, in one world.
 
-    The other arguments are those of ``choose_decelerations`` for one world. The formulas use the state when the vehicle
-    begins to brake: gap d, the vehicle's speed v, the neighbour's speed u, closing speed w, and the time s for which
-    the neighbour still coasts before it brakes with b. A candidate may be invalid: outside [0, capacity], or not a
-    number.
+    At the onset of braking: gap d, speed v, the neighbour's speed u, closing speed w, and the time s for which the
+    neighbour still coasts before it brakes with b. A candidate may be outside [0, capacity], or not a number. Other
+    arguments: ``choose_decelerations``.
     """
     gap, speed, onset = line[GAP], line[SPEED], wait[body]
     at[:] = 0.0
@@ -131,10 +125,9 @@ def find_candidates(line, braking, wait, body, at):
 def choose_decelerations(line, braking, wait, body, at, harm, best, least):
     """Write the best deceleration of vehicle ``body`` in each world to ``best`` [n] (m/s2), H to ``least`` [n] (m2/s2).
 
-    ``line`` is the array of a ``State``, ``braking`` [n, N + 1] each vehicle's braking capacity or present deceleration
-    (m/s2), ``wait`` [n, N + 1] the time until each vehicle may begin to brake (s); ``at`` and ``harm`` [C] are working
-    memory for C candidates. If several candidates are equally good, let a be the smallest and b the largest. The result
-    is ``(a + b) / 2`` if H is as small there, otherwise a.
+    ``line``: as in ``State``; ``braking`` [n, N + 1]: capacity or present deceleration of each vehicle (m/s2); ``wait``
+    [n, N + 1]: time until it may brake (s); ``at``, ``harm`` [C]: working memory. Of equally good candidates from a to
+    b the result is ``(a + b) / 2`` if H is as small there, otherwise a.
     """
     for k in range(line.shape[0]):
         find_candidates(line[k], braking[k], wait[k], body, at)
@@ -169,10 +162,8 @@ def closed_form(alert: State, braking: Floats, body: int) -> ConstantDeceleratio
 def pairwise(alert: State, body: int) -> ConstantDeceleration:
     """Deceleration of vehicle ``body`` (1: Vehicle 1) that minimises the predicted harm H, and H, in every world.
 
-    Of equally good decelerations, such as all that avoid both impacts, the middle one is the result. The result depends
-    on gaps, speeds, capacities and latencies of the vehicle and its neighbours, and ignores an obstacle.
-
-    Raises ``InvalidInput`` for worlds that depart from the plain game other than by an obstacle or the paper's map.
+    Of equally good decelerations the middle one. An obstacle is ignored. Raises ``InvalidInput`` for worlds that depart
+    from the plain game other than by an obstacle or the paper's map.
     """
     require(alert, "e_v2x_bm:pairwise", {OBSTACLE, MAP})
     return closed_form(alert, np.ascontiguousarray(capacities(alert.car, BRAKING)), body)

@@ -122,7 +122,6 @@ class PolicyAgent(RangeObserver):
     knows: str = MESSAGES
 
     def check(self, game: Game, body: int) -> None:
-        """Raise ``InvalidInput`` if the policy may have been trained on other features than those in ``game``."""
         if self.is_assumed and game.views[body] != self.observation:
             raise InvalidInput(
                 f"agent {self.name!r}: nothing says which features the policy observes, and vehicle_{body} of scenario"
@@ -134,9 +133,8 @@ class PolicyAgent(RangeObserver):
         return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Commands, [n] m/s2, and the policy's new memory.
-
-        Raises ``AgentFailed`` for actions of a wrong shape or outside their range.
+        """Commands, [n] m/s2, and the policy's new memory. Raises ``AgentFailed`` for actions of a wrong shape or
+        range.
         """
         observations = self.observe(self.observation, state, body)
         if self.initial_state is None:
@@ -163,10 +161,7 @@ class PolicyAgent(RangeObserver):
         return map_arrays(copied, memory)
 
     def _actions(self, answer: Any, state: State, body: int) -> Floats:
-        """Actions in [-1, 1], [n], from the answer of the policy.
-
-        Raises ``AgentFailed`` for a wrong shape or kind of numbers, and without ``clip`` for a number out of range.
-        """
+        """Actions in [-1, 1], [n], from the answer of the policy."""
         action_array, n, last = to_array(answer), state.n, (self.actions or 0) - 1
         kinds, low, high, right = "fiu", -1.0, 1.0, "a number in [-1, 1]"
         if self.actions is not None:
@@ -222,7 +217,7 @@ def policy_agent(
         actions: number of discrete actions, evenly spaced from -1 to 1, if the policy returns indices.
         ignore_wrappers: accept a model whose training environment has wrappers that may change observations or actions.
 
-    Raises ``InvalidInput`` for an unknown kind of policy, and if observations or actions would differ from those of its
+    Raises ``InvalidInput`` for an unknown kind of policy, and if observations or actions would differ from its
     training.
 
     >>> import ethbrake_marl as eb
@@ -266,7 +261,6 @@ def policy_agent(
 
 
 def _view(observation: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:
-    """Features that a policy observes: ``observation``, or ``trained_on``, or those of learners in ``trained_in``."""
     if observation is not None:
         view = observation if isinstance(observation, View) else View(observation)
         if trained_on not in (None, view.names):

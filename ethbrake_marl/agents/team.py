@@ -80,8 +80,7 @@ class Team(NamedTuple):
     def game(self, game: Game) -> Game:
         """The game with this team's shield.
 
-        Raises ``InvalidInput`` if the team does not drive exactly the learners, if it has a shield but the game has no
-        learners, or if the game has another shield.
+        Raises ``InvalidInput`` if the team does not drive exactly the learners, or if the game has another shield.
         """
         driven, learners = sorted(self.drivers), sorted(game.settings.learners.tolist())
         if driven != learners:
@@ -105,10 +104,7 @@ class Team(NamedTuple):
 
 
 def check_agent(agent: Any, where: str) -> None:
-    """Raise ``InvalidInput`` unless an agent has ``name``, ``knows``, ``begin`` and ``act``.
-
-    The message begins with ``where``.
-    """
+    """Raise ``InvalidInput``, beginning with ``where``, unless an agent has all attributes of ``Agent``."""
     missing = [part for part in ("name", "knows", "begin", "act") if not hasattr(agent, part)]
     if missing:
         raise InvalidInput(
@@ -119,18 +115,17 @@ def check_agent(agent: Any, where: str) -> None:
 
 
 def check_knows(knows: Any, where: str) -> None:
-    """Raise ``InvalidInput`` unless ``knows`` is one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
     if not isinstance(knows, str) or knows not in (*KNOWLEDGE, UNSTATED):
         right = ", ".join(repr(text) for text in KNOWLEDGE)
         raise InvalidInput(f"{where}: knows = {knows!r:.60}: must be one of {right}, or {UNSTATED!r}")
 
 
 def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Iterator[tuple[Step | None, State]]:
-    """Let a team drive the worlds ``alert`` to the end; yield each state with the step that led to it.
+    """Let a team drive the worlds ``alert`` to the end; yield each state with the step that led to it (at first
+    ``None``).
 
-    ``alert``: worlds at the alert. The first pair is ``None`` and the state at the first decision. Without a shield the
-    agents' commands (m/s2) are applied directly; a shield asks its own agents for proposals. ``donate``: each state is
-    overwritten when the next one is computed.
+    Without a shield the agents' commands (m/s2) are applied directly; a shield asks its own agents for proposals.
+    ``donate``: each state is overwritten when the next one is computed.
     """
     if not isinstance(team, Team):
         raise InvalidInput(f"team = {team!r:.60}: must be a Team, for instance Team.of({{'vehicle_2': agent}}, 'mine')")
@@ -150,7 +145,7 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
 
 
 def play_to_end(game: Game, alert: State, team: Team) -> State:
-    """Let a team drive worlds from the alert to the end; return the last state."""
+    """Last state of the worlds ``alert`` driven by a team."""
     for _, state in play(game, alert, team, donate=True):
         last = state
     return last
@@ -181,10 +176,7 @@ def agents_measures(drivers: Mapping[int, Any], last: State, memories: Mapping[i
 
 
 def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
-    """Actions that agents propose, [n, L] in the order of ``drivers``, and their new memories.
-
-    ``drivers``: vehicle (1: Vehicle 1) -> agent. ``memories``: vehicle -> memory, old and new.
-    """
+    """Actions that agents propose, [n, L] in the order of ``drivers`` (vehicle -> agent), and their new memories."""
     actions, after = np.empty((state.n, len(drivers))), dict(memories)
     for column, (body, agent) in enumerate(drivers.items()):
         commands, after[body] = ask_script(agent, state, memories[body], body)

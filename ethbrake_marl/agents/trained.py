@@ -18,11 +18,9 @@ ANY_ALGORITHM = ("policy", "team")  # names that stand for whatever algorithm ha
 def make_trained(argument: str | None, settings: Any) -> Agent | Team:
     """Agent or team for a policy at a path (``settings.policy``), or for a shipped policy if there is no path.
 
-    The path is the folder of a training run or bundle. ``argument``, or else the name before the ``@``, is the
-    algorithm that must have trained the policy; ``policy`` and ``team`` allow any. ``settings`` are
-    ``names.AgentSettings``. A run in which each learner has its own policy gives a team; the folder of one of its
-    policies gives an agent. Raises ``InvalidInput`` for a policy of another algorithm, and the errors of
-    ``load_policy``.
+    ``argument``, or else the name before the ``@``, is the algorithm that must have trained the policy; ``policy`` and
+    ``team`` allow any. A run in which each learner has its own policy gives a team. Raises ``InvalidInput`` for a
+    policy of another algorithm, and the errors of ``load_policy``.
     """
     spec, path = settings.spec, settings.policy
     name = argument or spec.partition("@")[0]

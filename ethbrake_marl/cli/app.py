@@ -24,7 +24,7 @@ from typer.main import get_command, get_group
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
-from ethbrake_marl.cli.command import INTERRUPTED, Out, example
+from ethbrake_marl.cli.command import INTERRUPTED, UNWRITTEN, Out, example, refuse
 from ethbrake_marl.errors import EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.registry import DISTRIBUTION, Registry, giver, points
 
@@ -87,9 +87,9 @@ def repeat_interrupt(ignored: sys.UnraisableHookArgs) -> None:
 def run_command(arguments: Sequence[str]) -> int:
     """Run the command line ``ethbrake ARGUMENTS``, and return the exit status.
 
-    0: success. 1: the program that reads the output has closed the pipe. 2: wrong usage, invalid input or a file error,
-    explained in one line on stderr. 130: Ctrl-C. A command may choose another status. Every other exception is a bug of
-    this program and is raised.
+    0: success. 1: the program that reads the output has closed the pipe. 2: wrong usage or invalid input. 3: a file or
+    stdout cannot be written. 2 and 3 are explained in one line on stderr. 130: Ctrl-C. A command may choose another
+    status. Every other exception is a bug of this program and is raised.
     """
     try:
         status = _status_of(arguments)
@@ -102,16 +102,16 @@ def run_command(arguments: Sequence[str]) -> int:
         where = context.command_path if context else "ethbrake"
         message = re.sub(r"Value error, |, unable to parse string as an? \w+", "", error.format_message())
         message = message.replace("Input should be", "must be").replace("a valid integer", "a whole number")
-        return _refuse(f"{message} (see: {where} --help)")
+        return refuse(f"{message} (see: {where} --help)")
     except EthBrakeError as error:
-        return _refuse(str(error))
+        return refuse(str(error))
     except OSError as error:
         abandon_output()
         if isinstance(error, BrokenPipeError):
             return 1
-        return _refuse(f"{error.filename or 'output'!s:.200}: {error.strerror or error}")
+        return refuse(error, UNWRITTEN)
     except MemoryError as error:
-        return _refuse(f"not enough memory{f' ({error})' if str(error) else ''}; use fewer worlds at once")
+        return refuse(f"not enough memory{f' ({error})' if str(error) else ''}; use fewer worlds at once")
     except KeyboardInterrupt:
         return _interrupted()
     except Exception:
@@ -119,7 +119,7 @@ def run_command(arguments: Sequence[str]) -> int:
             raise
         return _interrupted()  # LLVM's callers miss what the interrupted function would have done
     except BaseException as error:  # GeneratorExit and similar, which this package never raises
-        return _refuse(f"your own code ended the process: {describe_error(error)}")
+        return refuse(f"your own code ended the process: {describe_error(error)}")
     return status
 
 
@@ -144,11 +144,6 @@ def _status_of(arguments: Sequence[str]) -> int:
 def _interrupted() -> int:
     Out().note("interrupted; repeat the command")
     return INTERRUPTED
-
-
-def _refuse(reason: str) -> int:
-    Out().note(f"ethbrake: error: {reason}")
-    return 2
 
 
 def prepare_streams() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
-from contextlib import redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +15,7 @@ import typer
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
-from ethbrake_marl.errors import InvalidInput, one_line, plain_text
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, one_line, plain_text
 from ethbrake_marl.faces.registration import register_environments
 from ethbrake_marl.progress import Progress, ShownProgress
 
@@ -23,6 +23,7 @@ from ethbrake_marl.progress import Progress, ShownProgress
 _UNESCAPED = "\n\t\N{NO-BREAK SPACE}"
 
 INTERRUPTED = 130  # exit status after Ctrl-C: 128 + SIGINT, as shells expect
+UNWRITTEN = 3  # exit status if output cannot be written
 
 ScenarioOption = Annotated[
     str, typer.Option(metavar="NAME|PATH", help="Name of a shipped or registered scenario, or path of a YAML file.")
@@ -89,6 +90,7 @@ class Out:
         self._stdout = sys.stdout
         self.show_progress = ShownProgress()  # receives the progress that a function of the package reports
         self._turned = redirect_stdout(sys.stderr)
+        self.unwritten: list[OSError | EthBrakeError] = []
 
     def __enter__(self) -> Self:
         """Redirect stdout to stderr, and register the Gymnasium environments for the user's code."""
@@ -105,6 +107,16 @@ class Out:
             self.interrupted(f"interrupted; {self.remains}")
         if isinstance(error, SystemExit):
             raise InvalidInput(f"your own code ended the process: SystemExit: {error.code}") from error
+        if error is None and self.unwritten:
+            raise typer.Exit(refuse(self.unwritten[0], UNWRITTEN))
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Context for writing results that are also printed: an error waits until the command has printed them."""
+        try:
+            yield
+        except (OSError, EthBrakeError) as error:
+            self.unwritten.append(error)
 
     def result(self, content: Any, *parts: RenderableType, in_file: bool = False) -> None:
         """Print the result: ``content`` as JSON if the user chose ``--json``, otherwise ``parts``.
@@ -167,6 +179,14 @@ class Out:
 
     def progress(self, name: str, count: int, total: int) -> None:
         self.show_progress(Progress(name, count, total))
+
+
+def refuse(reason: Exception | str, status: int = 2) -> int:
+    """Print why a command failed, and return its exit status."""
+    if isinstance(reason, OSError) and not isinstance(reason, EthBrakeError):
+        reason = f"{reason.filename or 'output'!s:.200}: {reason.strerror or reason}"
+    Out().note(f"ethbrake: error: {reason}")
+    return status
 
 
 class _PlainConsole(Console):

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
-from importlib.util import find_spec
 from pathlib import Path
 
 import typer
@@ -54,17 +53,10 @@ def _dependencies() -> Iterator[Check]:
     """Check that each required package is installed, in a version that fits. Packages of extras may be missing."""
     from packaging.requirements import Requirement
 
-    from ethbrake_marl.faces.rendering import RENDERERS, why_not
-
     for requirement in map(Requirement, requires("ethbrake-marl") or []):
         marker = requirement.marker
         is_optional = marker is not None and any(marker.evaluate({"extra": each}) for each in EXTRA_OF.values())
         if marker and not is_optional:  # for development, or for another Python
-            continue
-        # The package pygame has a module of the same name, and the last one installed is there.
-        is_checked = requirement.name == "pygame-ce" and "human" in RENDERERS and find_spec("pygame") is not None
-        if is_checked and (reason := why_not("human")):
-            yield Check(requirement.name, False, reason)
             continue
         try:
             installed = version(requirement.name)

@@ -93,9 +93,10 @@ def evaluate_command(
             comparisons[name] = _compare(out, name, chosen, agents, count, seed, jobs, is_benchmark=is_benchmark)
         if report and output is not None:
             write = page_function("evaluation", "--report")
-            output.mkdir(parents=True, exist_ok=True)
-            write(output / REPORT, comparisons[scenario], "ethbrake " + " ".join(sys.argv[1:]), force=force)
-            out.note(f"report: {output / REPORT}")
+            with out.writing():
+                output.mkdir(parents=True, exist_ok=True)
+                write(output / REPORT, comparisons[scenario], "ethbrake " + " ".join(sys.argv[1:]), force=force)
+                out.note(f"report: {output / REPORT}")
         _show(out, comparisons, output, per_world, REPORT if report else "", is_benchmark=is_benchmark)
 
 
@@ -130,8 +131,10 @@ def _show(
 
     tables = {name: comparison.table for name, comparison in comparisons.items()}
     results = {name: comparison.result for name, comparison in comparisons.items()}
-    if output is not None:
-        for name, table in tables.items():
+    for name, table in tables.items():
+        if output is None:
+            break
+        with out.writing():
             place = output / name if len(tables) > 1 else output
             place.mkdir(parents=True, exist_ok=True)
             for file in {*FILES} - {page}:
@@ -141,8 +144,9 @@ def _show(
     if is_benchmark:
         rows, sheet = benchmark_rows(tables), benchmark_sheet(tables)
         if output is not None:
-            write_output(output / ROWS, csv_text(rows).encode(), force=out.force)
-            out.note(f"rows: {output / ROWS}")
+            with out.writing():
+                write_output(output / ROWS, csv_text(rows).encode(), force=out.force)
+                out.note(f"rows: {output / ROWS}")
     elif len(tables) > 1:
         sheet = summarise_lists(tables, results)
         scenarios = (name for name, table in tables.items() for _ in table)

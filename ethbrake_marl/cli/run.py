@@ -91,6 +91,7 @@ def experiment_command(
             settings=changes.texts,
             report=PAGES["run"]() if "run" in PAGES else None,
             on_progress=out.show_progress,
+            on_unwritten=out.unwritten.append,
         )
         trained = experiment.trained
         objective = trained.training.objective

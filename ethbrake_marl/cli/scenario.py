@@ -268,11 +268,12 @@ def scenario_sample(
         cells = (("" if value is None else repr(value) for value in row.values()) for row in states)
         lines = [",".join(columns), *map(",".join, cells)]
         if picture_file is not None:
-            page_function("worlds", f"--output {picture_file.name}")(
-                picture_file, chosen, n, seed=seed, force=out.force
-            )
-            out.note(f"picture: {picture_file}")
+            draw_worlds = page_function("worlds", f"--output {picture_file.name}")
+            with out.writing():
+                draw_worlds(picture_file, chosen, n, seed=seed, force=out.force)
+                out.note(f"picture: {picture_file}")
         elif output is not None:
-            out.write(output, "\n".join([*lines, ""]), what="worlds")
+            with out.writing():
+                out.write(output, "\n".join([*lines, ""]), what="worlds")
         if output is None or out.as_json:
             out.result(states, *lines, in_file=output is not None)

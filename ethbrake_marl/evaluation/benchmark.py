@@ -39,10 +39,9 @@ NOTE = (
 
 
 def benchmark_measures(scenario: Scenario, *, episodes: int, seed: int) -> list[str]:
-    """Names of the measures of ``COLUMNS`` as far as they are installed, except those of every evaluation.
+    """Names of the measures of ``COLUMNS`` that are installed, except those of every evaluation.
 
-    The best known cost, and so the share of the possible, is measured only in the worlds of the benchmark's lists: the
-    first ``EPISODES`` worlds of ``SEED`` of a task without changes.
+    The best known cost is measured only in the first ``EPISODES`` worlds of ``SEED`` of an unchanged task.
     """
     is_listed = scenario.name in group_of_scenarios(BENCHMARK) and seed == SEED and episodes <= EPISODES
     is_listed = is_listed and scenario.content() == load_scenario(scenario.name).content()
@@ -57,7 +56,6 @@ def evaluate_task(scenario: AnyScenario, agents: Any, *, episodes: int = EPISODE
 
 
 def benchmark_sheet(tables: Mapping[str, SummaryTable]) -> Sheet:
-    """Table of the benchmark: a section for each task (key of ``tables``), a row for each team."""
     rows: list[Any] = []
     for task, table in tables.items():
         rows.append(task)
@@ -66,11 +64,7 @@ def benchmark_sheet(tables: Mapping[str, SummaryTable]) -> Sheet:
 
 
 def benchmark_rows(tables: Mapping[str, SummaryTable], **about: Any) -> list[dict[str, Any]]:
-    """Rows of the benchmark's file. ``about``: further columns, such as ``method``, ``seed``, ``decisions``, ``cpu_s``.
-
-    Columns of the file: ``task``, ``agent``, ``about``, the estimates of ``COLUMNS`` with intervals, what the team
-    knows, the number and SHA-256 of the worlds, the digest of the physics and the version.
-    """
+    """Rows of the benchmark's file. ``about``: further columns, such as ``method`` or ``cpu_s``."""
     rows = []
     for task, table in tables.items():
         identity = {key: table.parameters[key] for key in ("worlds_sha256", "physics_digest")}

@@ -31,9 +31,8 @@ class Comparison(NamedTuple):
         measures: Iterable[str] | str = (),
         **more: Any,
     ) -> Comparison:
-        """Evaluate the teams by ``evaluate(..., **more)``, and summarise the result.
-
-        For the count ``honest`` the measure ``pushed_mps`` is added.
+        """Evaluate the teams by ``evaluate(..., **more)``. For the count ``honest`` the measure ``pushed_mps`` is
+        added.
         """
         names = split_names(measures) if isinstance(measures, str) and measures else [*measures]
         if harm_count == "honest":
@@ -42,6 +41,5 @@ class Comparison(NamedTuple):
         return cls(scenario, teams, result, summarise(result), harm_count)
 
     def worlds(self, rows: Iterable[int] | Ints) -> State:
-        """Worlds of the result with the indices ``rows``, at the alert."""
         numbers, seed = self.result.worlds["world"], self.result.about["seed"]
         return State.join([self.scenario.sample(1, seed, first=int(numbers[row])) for row in rows])

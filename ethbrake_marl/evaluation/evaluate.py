@@ -25,7 +25,7 @@ from ethbrake_marl.evaluation.provenance import about_scenario, policy_digests, 
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
 from ethbrake_marl.parallel import run_each
-from ethbrake_marl.worlds.describe import clusters_of, columns_of
+from ethbrake_marl.worlds.describe import LABELS, clusters_of, columns_of
 from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.sampling import DrawnWorlds
 
@@ -84,10 +84,7 @@ class Result:
         return team in self.columns
 
     def take(self, rows: Any) -> Result:
-        """Result restricted to some worlds. ``rows``: indices of worlds, or a mask [n].
-
-        Raises ``InvalidInput`` if no world is left.
-        """
+        """Result of some worlds: ``rows`` are indices or a mask [n]. Raises ``InvalidInput`` if no world is left."""
         columns = {
             team: {name: values[rows] for name, values in team_columns.items()}
             for team, team_columns in self.columns.items()
@@ -100,7 +97,7 @@ class Result:
         return replace(self, columns=columns, worlds=worlds, about=about)
 
     def arrays(self) -> Columns:
-        """Table with one row per team and world: column name -> values, [teams * n]. Missing numbers are NaN."""
+        """Table with one row per team and world: column name -> [teams * n]. Missing numbers are NaN."""
         names = list(dict.fromkeys(name for team_columns in self.columns.values() for name in team_columns))
         table: Columns = {"agent": np.repeat([*self.columns], self.n)}
         table |= {name: np.tile(values, len(self.columns)) for name, values in self.worlds.items()}
@@ -194,29 +191,22 @@ def evaluate_teams(
     about: Mapping[str, Any] | None = None,
     on_done: Callable[[int], None] | None = None,
 ) -> Result:
-    """Let every team drive every world once. Results have the same bits for any number of processes.
-
-    Args:
-        worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State`` (without recordings).
-        agents: name in tables -> team, which controls all learners of the game.
-        game: game of the worlds' scenario.
-        measures: further measures, for instance ``measures_called("pushed_m,pushed_mps")``.
-        jobs: number of processes.
-        about: entries to add to ``Result.about``, usually those of ``provenance.about_scenario``.
-        on_done: function that is called with the number of worlds that all teams have driven so far.
+    """Let every team drive every world once. ``about``: further entries of ``Result.about``; the rest as in
+    ``evaluate``.
 
     Raises ``InvalidInput`` for worlds that are not at the alert, for worlds or a team that do not fit the game, for
     measures with the same name, and for bad commands of an agent; ``PhysicsError`` if a check of the physics fails.
-
     """
     if jobs is not None:
         check_whole_number("jobs", jobs, 1)
     draw = worlds if isinstance(worlds, DrawnWorlds) else DrawnWorlds.from_state(worlds)
     _check(draw.worlds, agents, game)
     chosen = (*DEFAULT, *measures)
-    alert, n, of_worlds = game.marked(draw.worlds), draw.worlds.n, columns_of(draw)
+    n, of_worlds, labels = draw.worlds.n, columns_of(draw), draw.worlds.memories.get(LABELS, {})
+    memories = {name: memory for name, memory in draw.worlds.memories.items() if name != LABELS}
+    alert = game.marked(draw.worlds._replace(memories=memories))
     for measure in chosen:
-        if measure.name in of_worlds:
+        if measure.name in of_worlds or any(name.startswith(f"{measure.name}_") for name in labels):
             raise InvalidInput(f"measure {measure.name!r}: is the name of a column of the worlds; give another name")
     owners: dict[str, Measure] = {}
     for measure in chosen:
@@ -276,7 +266,6 @@ def drive_chunk(alert: State, agents: Mapping[str, Team], game: Game, measures: 
 
 
 def _drive_team(alert: State, name: str, team: Team, game: Game, measures: Sequence[Measure]) -> Driven:
-    """Let a team drive all worlds to the end; return the columns of all measures, name -> [n]."""
     full_game, start = team.game(game), alert.read_only()
     watches: list[tuple[Measure, Watch]] = []
     for measure in measures:
@@ -325,10 +314,7 @@ def _reports_of(team: Team, game: Game, last: State) -> dict[str, Any]:
 
 
 def _join_columns(parts: Sequence[Columns]) -> Columns:
-    """Columns of all worlds, name -> [n], from those of consecutive chunks of worlds.
-
-    A column that a chunk lacks is left out.
-    """
+    """Columns of all worlds from those of consecutive chunks; a column that a chunk lacks is left out."""
     return {
         name: np.concatenate([part[name] for part in parts]) for name in parts[0] if all(name in part for part in parts)
     }
@@ -337,8 +323,7 @@ def _join_columns(parts: Sequence[Columns]) -> Columns:
 def hidden_from(alert: State, game: Game) -> Bools:
     """Whether the V2X channel hides something from a learner at its first decision, [n].
 
-    True if the learner lacks a quantity of another vehicle. Also true if another vehicle waits for a message, and so
-    reacts later than the latency that it reports.
+    Also true if another vehicle waits for a message, and so reacts later than the latency that it reports.
     """
     late, hidden = alert.car[:, LATENCY] > alert.car[:, OWN_LATENCY], np.zeros(alert.n, np.bool_)
     for i in game.settings.learners.tolist():

@@ -113,8 +113,8 @@ def split_names(names: str) -> list[str]:
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
     """Measures with these names, without duplicates: registered measures, summed terms of a reward, objectives.
 
-    ``FILE.py:NAME`` runs the file and takes its measure NAME. If the result contains another measure NAME, this one is
-    called ``FILE.py:NAME``. Raises ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
+    ``FILE.py:NAME`` runs the file and takes its measure NAME, which keeps this long name beside another NAME. Raises
+    ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
     """
     if not isinstance(names, Iterable):
         raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'pushed_mps,pushed_m'")
@@ -145,7 +145,7 @@ def _qualify_measure(name: str, measure: Measure) -> Measure:
 
 
 def _measures_named(name: str) -> list[Measure]:
-    """Measures that one name stands for; more than one if the name is an entry point with several measures."""
+    """Measures that one name stands for; several for an entry point with several."""
     if name in MEASURES and name in TERMS:
         raise AlreadyExists(f"measure {name!r}: a measure and a term of the reward have this name; rename one of them")
     if name in MEASURES:
@@ -192,7 +192,7 @@ def _sum_of_term(name: str, term: TermFunction, unit: str) -> Measure:
 
 
 def _intervention(before: State, step: Step, after: State) -> Floats:
-    """Term ``intervention`` of the reward (``shields.shield``); 0 without a shield, so that tables can compare both."""
+    """The term ``intervention``; 0 without a shield, so that tables can compare both."""
     if "shield" not in after.memories:
         return np.zeros(after.speeds_mps.shape)
     return TERMS["intervention"].value(before, step, after)

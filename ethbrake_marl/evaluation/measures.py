@@ -63,9 +63,7 @@ class Watch(Protocol):
     """A measure that is computed from every step of the episodes."""
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Process one step from ``before`` to ``after``. ``step`` is None for the motion from the alert to the first
-        decision.
-        """
+        """Process one step; ``step`` is None for the motion from the alert to the first decision."""
 
     def result(self, last: State) -> MeasureValue:
         """Value of the measure after the episodes, in a form that a measure's function may return."""
@@ -74,8 +72,8 @@ class Watch(Protocol):
 class Statistic(NamedTuple):
     """Statistic of a measure's column, for tables and JSON.
 
-    The kind ``rate`` is the share of worlds in which the column is true, ``worst`` the mean of its largest 5 %,
-    ``difference`` the mean difference from the baseline, ``decrease`` 1 - (mean) / (mean of the baseline).
+    ``rate``: share of worlds in which the column is true. ``worst``: mean of its largest 5 %. ``difference``: mean
+    difference from the baseline. ``decrease``: 1 - (mean) / (mean of the baseline).
     """
 
     key: str  # name in JSON
@@ -97,10 +95,9 @@ class Measure(NamedTuple):
 
 
 def measure_columns(measure: Measure, measurement: MeasureValue, last: State) -> dict[str, MeasureValues]:
-    """Columns of a measure, name -> [n], from the value that the measure returned.
+    """Columns of a measure, name -> [n], from the value that it returned. ``last``: last states of the episodes.
 
-    ``last``: last states of the episodes. Raises ``InvalidInput`` for a wrong shape or type, and for numbers that are
-    not finite.
+    Raises ``InvalidInput`` for a wrong shape or type, and for numbers that are not finite.
     """
     if measurement is None:
         return {}
@@ -126,7 +123,7 @@ def measure_columns(measure: Measure, measurement: MeasureValue, last: State) ->
 
 @contextmanager
 def naming(measure: Measure) -> Iterator[None]:
-    """Turn an exception in the block into an ``InvalidInput`` that names the measure; errors of this package pass."""
+    """Turn an exception into an ``InvalidInput`` that names the measure; errors of this package pass."""
     try:
         yield
     except EthBrakeError:
@@ -144,10 +141,7 @@ def collided(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 def harm(count: str, game: Game, alert: State, last: State) -> MeasureValue:
-    """Harm at the end, [n] m2/s2: key ``""`` for the line, ``"1"`` to ``"N"`` for what each vehicle bears.
-
-    None for the honest cost if the physics has no exact impacts.
-    """
+    """Harm at the end, [n] m2/s2: key ``""`` for the line, ``"1"`` to ``"N"`` for what each vehicle bears."""
     if count == "honest" and not last.is_exact:
         return None
     borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}
@@ -263,27 +257,20 @@ def own_way_m(alert: State, body: int, until_s: float) -> Floats:
 
 
 class PushedAway:
-    """Measures how far vehicles end beyond the place that they would reach by the horizon if untouched (a ``Watch``).
-
-    The distance is negative if a vehicle ends short of that place, for instance because an obstacle threw it back.
-    """
+    """Measures how far vehicles end beyond the place that they would reach untouched; negative if thrown back."""
 
     def __init__(self, bodies: list[int], game: Game, alert: State) -> None:
         self.own_way_m = {body: own_way_m(alert, body, game.settings.horizon_s) for body in bodies}
         self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Simulate the step again (``with_post``), and add the distance that Vehicle 1 travels."""
         line = with_post(before)
         from_m = line[:, GAP, 0].copy()
         advance_worlds(line, before.car, before.time_s, after.time_s, after.wanted, scratch_for(line.shape[2]))
         self.way_m += from_m - line[:, GAP, 0]
 
     def result(self, last: State) -> MeasureValue:
-        """Excess distance of each vehicle, vehicle number -> [n] m.
-
-        ``1_far`` [n]: whether the distance of Vehicle 1 exceeds ``PUSHED_FAR_M``.
-        """
+        """Excess distance, vehicle number -> [n] m; ``1_far`` [n]: whether Vehicle 1 exceeds ``PUSHED_FAR_M``."""
         wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
         metres = {
             f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - untouched_m
@@ -315,8 +302,8 @@ def pushed_mps(game: Game, alert: State, last: State) -> MeasureValue:
 def first_impact_s(before: State, after: State) -> Floats:
     """Time of the line's first impact if it lies between the two states, [n] s.
 
-    Otherwise ``before.time_s`` after an earlier impact, and ``after.time_s`` if no impact has happened yet. There must
-    be no decision between the two states.
+    Else ``before.time_s`` after an earlier impact, ``after.time_s`` before any. There must be no decision between the
+    two.
     """
     until: Floats = np.where(before.collided, before.time_s, after.time_s)
     for k, scratch in simulate_again(before, after, ~before.collided & after.collided):
@@ -326,19 +313,12 @@ def first_impact_s(before: State, after: State) -> Floats:
 
 
 def driving_s(before: State, after: State, until_s: Floats) -> Floats:
-    """Time between ``before`` and ``until_s`` [n] in which each vehicle has a positive command in force, [n, N] s.
-
-    ``after``: the state after the step, which holds the commands.
-    """
+    """Time from ``before`` to ``until_s`` [n] with a positive command (of ``after``) in force, [n, N] s."""
     begun_s = np.maximum(before.car[:, LATENCY, 1:], before.time_s[:, np.newaxis])
     return np.where(after.commands_mps2 > 0.0, np.maximum(until_s[:, np.newaxis] - begun_s, 0.0), 0.0)
 
 
 class DroveTowards:
-    """Measures the share of the time before a line's first impact in which each vehicle has a positive command
-    (drives).
-    """
-
     def __init__(self, game: Game, alert: State) -> None:
         self.learners, self.time_s = game.settings.learners, np.zeros(alert.n)
         self.driving_s, self.hard = np.zeros((alert.n, alert.vehicles)), np.zeros(alert.n, np.bool_)

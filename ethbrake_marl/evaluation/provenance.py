@@ -26,8 +26,7 @@ KEYS_WITHOUT_EFFECT = ("name", "title", "description", "source")  # keys of a sc
 def worlds_sha256(worlds: State) -> str:
     """SHA-256 of worlds at the alert: of the quantities ``MOTION`` and ``PLAIN_ROWS``, of ``know`` and of ``wanted``.
 
-    Numbers are hashed as little-endian 64-bit floats. A further quantity of vehicles (row of ``car``) is hashed with
-    its name, unless it is 0 everywhere.
+    Numbers are little-endian floats. Another quantity of vehicles (row of ``car``) is hashed with its name, unless 0.
     """
     digest, arrays = hashlib.sha256(), [worlds.line[:, MOTION], worlds.car[:, PLAIN_ROWS], worlds.know, worlds.wanted]
     for name in sorted(CAR_NAMES):
@@ -50,18 +49,12 @@ def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Name -> version of Python and of every package that affects a result, including extensions.
-
-    Python files of the user that this process ran have their SHA-256 as version.
-    """
+    """Name -> version of Python and of every package that affects a result; of a user's Python file its SHA-256."""
     core_versions = {"python": platform.python_version()} | {name: version(name) for name in EVALUATION_PACKAGES}
     return core_versions | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 
 
 def policy_digests(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Vehicle -> SHA-256 of the manifest of its policy.
-
-    ``drivers``: vehicle number -> agent. Agents without a policy of this package are left out.
-    """
+    """Vehicle -> SHA-256 of the manifest of its policy, if it has one. ``drivers``: vehicle number -> agent."""
     manifests = {body: getattr(getattr(agent, "policy", None), "manifest", None) for body, agent in drivers.items()}
     return {f"vehicle_{body}": manifest.manifest_sha256 for body, manifest in manifests.items() if manifest is not None}

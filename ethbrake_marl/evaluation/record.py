@@ -6,10 +6,13 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.agent_names import open_game, require_learner, teams_of
 from ethbrake_marl.agents.team import Team, play
+from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.errors import InvalidInput, count_of
@@ -30,6 +33,7 @@ from ethbrake_marl.motion.layout import (
     Ints,
     scratch_for,
 )
+from ethbrake_marl.worlds.open_game import AnyScenario
 
 SAMPLE_S = 0.02  # usual time between two samples
 POST_M = 1e5  # distance to an imaginary post that no vehicle reaches; its gap gives distances to 1e-10 m
@@ -37,10 +41,7 @@ POST_M = 1e5  # distance to an imaginary post that no vehicle reaches; its gap g
 
 @dataclass(frozen=True)
 class Impacts:
-    """The m impacts of one episode, in order of time.
-
-    If a pair has several impacts between two samples of the record, they are one entry.
-    """
+    """The m impacts of one episode, in order of time; those of a pair between two samples are one entry."""
 
     time_s: Floats  # [m] of the first impact in the entry
     pair: Ints  # [m] 0: Vehicle 1 with the obstacle, p: vehicle_p and the one behind it
@@ -55,11 +56,9 @@ class EpisodeRecord:
     """Motion of one world at k times, from the alert to the end of its episode.
 
     >>> import ethbrake_marl as eb
-    >>> scenario, game = eb.open_game("paper-random")
-    >>> team = eb.Team.of({"vehicle_2": eb.make_agent("full_brake")}, "full_brake")
-    >>> record = eb.record_episode(scenario.sample(1, seed=7), team, game)
-    >>> record.positions_m.shape, record.impacts.time_s.round(2), record.at_rest
-    ((196, 3), array([2.17, 3.3 ]), True)
+    >>> record = eb.record_episode("paper-random", "full_brake", number=1)
+    >>> record.agent, record.gaps_m.shape, len(record.impacts.time_s)
+    ('full_brake', (186, 2), 6)
 
     """
 
@@ -78,12 +77,10 @@ class EpisodeRecord:
 
     @property
     def initial(self) -> State:
-        """The world at the alert."""
         return self.states[0]
 
     @property
     def last(self) -> State:
-        """The state at the end of the episode."""
         return self.states[-1]
 
     def __repr__(self) -> str:
@@ -95,31 +92,85 @@ class EpisodeRecord:
         )
 
 
-def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> EpisodeRecord:
-    """Let a team drive one world exactly as in ``evaluate``, and record the motion.
+def record_episode(
+    worlds: AnyScenario | State,
+    agent: Any,
+    *,
+    scenario: AnyScenario | None = None,
+    number: int = 0,
+    seed: int = 7,
+    harm_count: str = "first",
+    sample_s: float = SAMPLE_S,
+) -> EpisodeRecord:
+    """Let one agent drive one world exactly as in ``evaluate``, and record the motion.
 
-    Samples are at every decision, and at most ``sample_s`` apart. Raises ``InvalidInput`` unless there is exactly one
-    world at the alert, and ``sample_s`` is finite and above 0.
+    Args:
+        worlds: a scenario, or one world at the alert together with ``scenario``.
+        agent: name of an agent, an agent, a team, or a mapping from vehicles to agents.
+        scenario: scenario of the world, if ``worlds`` is one.
+        number: number of the world in the scenario's evaluation list.
+        seed: seed of the evaluation list.
+        harm_count: what an optimising agent minimises (``episode.counts``).
+        sample_s: longest time between two samples (s). There are also samples at every decision.
+
+    Raises the errors of ``evaluate``, and ``InvalidInput`` unless there are one agent and one world at the alert.
+
+    >>> import ethbrake_marl as eb
+    >>> record = eb.record_episode("paper-random", "full_brake")
+    >>> record.positions_m.shape, record.impacts.time_s.round(2), record.at_rest
+    ((196, 3), array([2.17, 3.3 ]), True)
+
     """
-    if world.n != 1 or world.time_s[0] != 0.0:
-        raise InvalidInput(
-            f"record_episode: world has {count_of(world.n, 'world')}; pass exactly 1 at the alert, for instance"
-            " worlds.take([0])"
-        )
+    agents = agent if isinstance(agent, str) else {str(getattr(agent, "name", "agents")): agent}
+    records = record_agents(
+        worlds, agents, scenario=scenario, number=number, seed=seed, harm_count=harm_count, sample_s=sample_s
+    )
+    if len(records) != 1:
+        raise InvalidInput(f"record_episode: agent {agent!r:.80} means {len(records)} agents; name one agent")
+    return next(iter(records.values()))
+
+
+def record_agents(
+    worlds: AnyScenario | State,
+    agents: Any,
+    *,
+    scenario: AnyScenario | None = None,
+    number: int = 0,
+    seed: int = 7,
+    harm_count: str = "first",
+    sample_s: float = SAMPLE_S,
+) -> dict[str, EpisodeRecord]:
+    """Record of each agent in one world, by name. ``agents`` as in ``evaluate``, the rest as in ``record_episode``."""
     if not (isinstance(sample_s, int | float) and 0.0 < sample_s < math.inf):
         raise InvalidInput(f"record_episode: sample_s = {sample_s!r}: must be a finite number of seconds above 0")
-    return record_episodes(world, team, game, sample_s)[0]
+    check_count("record_episode: harm_count", harm_count)
+    if isinstance(worlds, State):
+        if scenario is None:
+            raise InvalidInput("record_episode: a world needs its scenario, for instance scenario='paper-random'")
+        world, (loaded, game) = worlds, open_game(scenario)
+    else:
+        if scenario is not None:
+            raise InvalidInput("record_episode: scenario: is given twice; leave one of the two out")
+        loaded, game = open_game(worlds)
+        world = loaded.sample(1, seed, first=number)
+    require_learner(loaded)
+    if world.n != 1 or world.time_s[0] != 0.0:
+        raise InvalidInput(
+            f"record_episode: worlds has {count_of(world.n, 'world')}; pass exactly 1 at the alert, for instance"
+            " worlds.take([0])"
+        )
+    teams = teams_of(agents, loaded, harm_count=harm_count)
+    return {name: record_episodes(world, team, game, sample_s)[0] for name, team in teams.items()}
 
 
 def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> list[EpisodeRecord]:
-    """Records of several worlds that a team drives, one per world, as by ``record_episode``."""
+    """Records of several worlds that a team drives, one per world."""
     require(game.marked(worlds), "a record of the motion between decisions", simulates=True)
     states = [worlds, *(state for _, state in play(game, worlds, team))]
     return [_record_of([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]
 
 
 def _record_of(states: list[State], team: Team, game: Game, sample_s: float) -> EpisodeRecord:
-    """Record of one world, from its states at the alert and at every decision. States after the end are left out."""
     until = 2 + sum(not state.ended[0] for state in states[1:])
     states, world = states[:until], states[0]
     pieces = [_motion_pieces(before, after, sample_s) for before, after in pairwise(states)]
@@ -143,7 +194,6 @@ def _motion_pieces(before: State, after: State, sample_s: float) -> tuple[Floats
     """Motion of one world between two decisions, cut into k pieces of at most ``sample_s``.
 
     Returns times [k, 2] (s) and lines [k, 2, rows, N + 1] at both ends of each piece, and commands [k, N + 1] (m/s2).
-    Without an obstacle, a post far ahead shows how far Vehicle 1 has moved.
     """
     start, end = float(before.time_s[0]), float(after.time_s[0])
     count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
@@ -157,10 +207,7 @@ def _motion_pieces(before: State, after: State, sample_s: float) -> tuple[Floats
 
 
 def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impacts:
-    """Impacts in the pieces that ``_motion_pieces`` returns.
-
-    A piece with impacts is simulated again to get time and closing speed of each pair's first.
-    """
+    """Impacts in pieces of motion. A piece with impacts is simulated again for time and speed of each pair's first."""
     rows = [FIRST, TOTAL, IMPACTS]
     increase = lines[:, 1, rows] - lines[:, 0, rows]
     piece, pair = np.nonzero(increase[:, 2])
@@ -175,9 +222,8 @@ def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impac
 
 
 def with_post(state: State) -> Floats:
-    """Copy of ``state.line`` with an imaginary post far ahead of Vehicle 1, except in worlds with an obstacle.
-
-    The gap ahead of Vehicle 1 then shows how far the vehicle moves.
+    """Copy of ``state.line`` with a post far ahead of Vehicle 1, if there is no obstacle: its gap shows how far it
+    moves.
     """
     line = state.line.copy()
     line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
@@ -185,10 +231,10 @@ def with_post(state: State) -> Floats:
 
 
 def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wanted: Floats, scratch: Floats) -> int:
-    """Advance every world from ``time`` to ``until`` (s, [n] each); change ``line`` in place.
+    """Advance every world from ``time`` to ``until`` (s, [n] each) under the commands ``wanted``; change ``line`` in
+    place.
 
-    Returns the index of a world in which the simulation failed, or -1. All vehicles hold the commands ``wanted`` [n, N
-    + 1] (m/s2); the other arrays are described in ``motion.layout``.
+    Returns the index of a world in which the simulation failed, or -1. ``motion.layout`` describes the arrays.
     """
     moved = line.copy()  # arrays of any layout become alike, because a kernel is compiled for each layout
     failed: int = move_lines(moved, car.copy(), time.copy(), until.copy(), wanted.copy(), scratch)
@@ -197,10 +243,9 @@ def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wante
 
 
 def simulate_again(before: State, after: State, rows: Bools) -> Iterator[tuple[int, Floats]]:
-    """Simulate the worlds in the mask ``rows`` [n] again, from ``before`` to ``after``, one after the other.
+    """Simulate the worlds in the mask ``rows`` [n] again, between two states without a decision between them.
 
-    Yields the index of each world, and the scratch memory that the physics has filled (``motion.layout``). There must
-    be no decision between the two states.
+    Yields the index of each world, and the scratch memory of the physics (``motion.layout``).
     """
     require(before, "a quantity of single impacts", simulates=True)
     scratch = scratch_for(after.vehicles + 1)

@@ -33,10 +33,9 @@ def write_results(
     name: str = RESULTS,
     force: bool = False,
 ) -> list[Path]:
-    """Write ``FOLDER/results.json`` and, with ``rows``, ``FOLDER/worlds.csv`` or ``.parquet``; return their paths.
+    """Write ``FOLDER/NAME`` and, with ``rows``, ``FOLDER/worlds.csv`` or ``.parquet``; return their paths.
 
-    ``name`` renames the first file. Raises ``AlreadyExists`` if a file exists, unless ``force``, and ``MissingExtra``
-    for Parquet without pyarrow.
+    Raises ``AlreadyExists`` if a file exists, unless ``force``, and ``MissingExtra`` for Parquet without pyarrow.
     """
     target, objects = Path(folder).expanduser(), table.to_json()
     written = [check_target(target / name, force=force)]
@@ -53,10 +52,7 @@ def write_results(
 
 
 def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None:
-    """Write one row per team and world as CSV or Parquet, depending on the ending of ``path``.
-
-    Truth values are 1 and 0, missing values are empty. Raises the errors of ``write_results``.
-    """
+    """Write one row per team and world as CSV or Parquet; truth values are 1 and 0, missing values empty."""
     path, table = Path(path).expanduser(), result.arrays()
     plain = {name: column.astype(np.int64) if column.dtype == np.bool_ else column for name, column in table.items()}
     stream: Any
@@ -82,9 +78,8 @@ def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None
 
 
 def read_result(path: str | Path) -> dict[str, dict[str, Any]]:
-    """Content of a ``results.json``: team -> JSON object.
-
-    Raises ``InvalidInput`` for any other file, and for a file that was edited or damaged.
+    """Content of a ``results.json``, team -> object. Raises ``InvalidInput`` for one that was edited, and for other
+    files.
     """
     file = Path(path).expanduser()
     data = read_plain(file, MOST_BYTES)

@@ -44,11 +44,7 @@ Clusters = NDArray[Any] | None
 
 
 def mean(values: Floats, clusters: Clusters = None) -> Estimate:
-    """Mean with its t interval, ``mean -+ t s / sqrt(n)``.
-
-    If no value is negative, the interval does not go below 0. If all values are 0, there is no interval: zeros do not
-    show how large other values can be.
-    """
+    """Mean with its t interval, ``mean -+ t s / sqrt(n)``, not below 0 if no value is; none if all values are 0."""
     estimate = _mean(values, clusters)
     if (values < 0.0).any() or estimate.interval is None:
         return estimate
@@ -168,9 +164,10 @@ def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[Any]) -> t
 
 
 def _spread(residuals: Floats, weights: Floats, total: float) -> tuple[float, float, float] | tuple[None, None, None]:
-    """Standard error, degrees of freedom and skewness of a ratio, from each recording's sums [G].
+    """Standard error, degrees of freedom and skewness of a ratio, from each recording's sums [G] and the ``total``
+    weight.
 
-    ``total`` is the sum of all weights. All three are None if one recording has nearly all the weight.
+    All three are None if one recording has nearly all the weight.
     """
     groups, share = len(residuals), weights / total
     rest = 1.0 - share

@@ -85,7 +85,7 @@ class SummaryRow:
 
     @property
     def outside(self) -> float:
-        """Share of the decisions of the team's policies outside the range of their training; 0 if it is unknown."""
+        """Share of its policies' decisions outside the range of their training; 0 if unknown."""
         share = self.estimates.get("outside")
         return 0.0 if share is None else share.value
 
@@ -95,10 +95,7 @@ class SummaryRow:
 
     @property
     def exploits(self) -> dict[str, str]:
-        """Conduct of the team that harm does not count: name -> size in words.
-
-        ``pushes``: the team pushes Vehicle 1 far. ``moving``: a vehicle often still moves at the horizon.
-        """
+        """Conduct that harm does not count, in words: ``pushes`` Vehicle 1 far, ``moving`` at the horizon."""
         pushed, moving = self.estimates.get("pushed_m_1"), self.horizon_ends / self.episodes
         words = {}
         if pushed is not None and pushed.value > PUSHED_FAR_M:
@@ -109,12 +106,11 @@ class SummaryRow:
 
     @property
     def marked(self) -> str:
-        """Name of the team, with ‡ if the team has ``exploits``."""
         return f"{self.agent} {EXPLOITS}" if self.exploits else self.agent
 
     @property
     def about(self) -> str:
-        """What the team knows, with † if it is omniscient; and who drives which vehicle if its agents differ."""
+        """What the team knows, † if it is omniscient, and who drives which vehicle if its agents differ."""
         mixed = len({*self.drivers.values()}) > 1
         drivers = [f"{vehicle}: {agent}" for vehicle, agent in self.drivers.items() if mixed]
         return "; ".join([f"{SEES_THROUGH} " * self.sees_through + self.knows, *drivers])
@@ -170,7 +166,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], rows)
 
     def terminal(self) -> Sheet:
-        """Table for a terminal, with intervals only in the first columns, below their values."""
+        """Table for a terminal; only the first columns have intervals."""
         sheet, agent = self.sheet(), Column("Agent,\nwhat it knows", text=True)
         columns = [
             replace(column, interval="below" if column.name in FIRST_COLUMNS else "hidden")
@@ -184,7 +180,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
 
     def measures(self) -> Sheet | None:
-        """Table of the measures without a column in the main table, a column for each team; None if there are none.
+        """Table of the measures without a column in the main table; None if there are none.
 
         Vehicles whose values are equal under every team share a row.
         """
@@ -206,7 +202,7 @@ class SummaryTable(list[SummaryRow]):
         return [self.terminal(), *filter(None, [self.measures()])]
 
     def notes(self) -> list[str]:
-        """Warnings for a reader: rejected worlds, exploits, policies outside their training, hidden values."""
+        """Warnings: rejected worlds, exploits, policies outside their training, hidden values."""
         notes, rejected = [], self.parameters.get("rejected_draws", 0)
         if rejected:
             draws = rejected + self.parameters["count"]
@@ -236,7 +232,7 @@ class SummaryTable(list[SummaryRow]):
         return notes
 
     def meanings(self) -> dict[str, str]:
-        """Heading of a column -> its meaning; for a measure without a column, name of the measure -> meaning."""
+        """Heading of a column, or name of a measure without one -> meaning."""
         texts = {
             statistic.heading: statistic.meaning or measure.meaning
             for measure, statistic in self.statistics.values()
@@ -256,9 +252,8 @@ class SummaryTable(list[SummaryRow]):
         return [{"kind": "evaluate", **row.to_json(), **identity, "parameters": parameters} for row in self]
 
     def to_pandas(self) -> Any:
-        """``DataFrame`` with one row per team. ``x_low`` and ``x_high`` are the ends of the interval of ``x``.
-
-        Missing numbers are NaN. Raises ``MissingExtra`` without pandas.
+        """``DataFrame`` with one row per team; ``x_low`` and ``x_high`` are the ends of ``x``. ``MissingExtra`` without
+        pandas.
         """
         with naming_extras():
             from pandas import DataFrame
@@ -278,10 +273,9 @@ class SummaryTable(list[SummaryRow]):
 
 
 def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
-    """Table of a result, one row per team.
+    """Table of a result, one row per team, each compared with the ``baseline``, paired by world.
 
-    ``baseline`` is the team with which the others are compared, paired by world. If the default, full braking, is not
-    in the result, there are no comparisons; another missing team raises ``UnknownName``.
+    Without full braking, the default, there are no comparisons; another missing team raises ``UnknownName``.
     """
     if baseline != BASELINE and baseline not in result:
         raise unknown_name("baseline", baseline, result)
@@ -337,7 +331,7 @@ def _sort_position(entry: tuple[str, tuple[str, Measure, Statistic]]) -> int:
 def _estimate(
     statistic: Statistic, values: MeasureValues | None, baseline: MeasureValues | None, clusters: NDArray[Any] | None
 ) -> Estimate | None:
-    """Estimate of a statistic, from a team's column and the baseline's, [n] each; None if one of them is missing."""
+    """Estimate of a statistic from the columns of team and baseline, [n]; None if one of them is missing."""
     if values is None or (statistic.kind in COMPARE and baseline is None):
         return None
     if statistic.kind == "rate":
@@ -353,9 +347,8 @@ def _estimate(
 def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
     """One table for each group of worlds, in alphabetical order.
 
-    ``by`` is ``scenario`` (in a mixture), ``recording``, or a vehicle's type such as ``vehicle_2_type``; ``baseline``
-    as in ``summarise``. Raises ``InvalidInput`` if the worlds have no groups, and ``UnknownName`` if ``by`` is none of
-    these.
+    ``by``: ``scenario`` (in a mixture), ``recording``, a vehicle's type such as ``vehicle_2_type``, or a label
+    (``worlds_from_table``). Raises ``InvalidInput`` without groups, ``UnknownName`` for none of these.
     """
     kinds = {name: column for name, column in result.worlds.items() if column.dtype.kind == "U"}
     if not kinds:
@@ -371,10 +364,7 @@ def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[s
 
 
 def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Result]) -> Sheet:
-    """One table of several evaluations, such as the tests of a standard: a section per evaluation, a row per team.
-
-    A team passes a test if no world has an impact.
-    """
+    """One table of several evaluations, such as the tests of a standard: a section for each. No impact: passed."""
     columns: list[Column | str] = [
         Column("Agent", "agent", text=True), Column("Result", "result"),
         Column("Collisions", "collision_rate", **_PERCENT),
@@ -403,10 +393,9 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
 
 
 def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
-    """Quantities of worlds, key -> value, or ``[smallest, largest]`` if the worlds differ.
+    """Quantities of worlds, key -> value, or ``[smallest, largest]`` if they differ; a list for each vehicle or pair.
 
-    A quantity of vehicles or pairs has a list with an entry for each of them: ``{"gaps_m": [7.0, [5.0, 9.0]],
-    "restitution": 0.1}``. ``worlds``: columns, name -> [n]. A column without any number is left out.
+    ``worlds``: columns, name -> [n]. A column without any number is left out.
     """
     ranges: dict[str, Any] = {}
     for key, rule in QUANTITIES.items():
@@ -420,7 +409,7 @@ def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def caption(parameters: Mapping[str, Any]) -> str:
-    """One line with scenario, number of worlds, seed, recordings and quantities, from ``SummaryTable.parameters``."""
+    """One line about the worlds, from ``SummaryTable.parameters``."""
     parts = []
     for key, (symbol, unit) in SYMBOLS.items():
         if key in parameters:
@@ -435,7 +424,7 @@ def caption(parameters: Mapping[str, Any]) -> str:
 
 
 def by_recording(recordings: int) -> str:
-    """End of a caption: the number of traffic recordings on which the 95 % intervals rest; empty for 0 recordings."""
+    """End of a caption: on how many recordings the 95 % intervals rest; empty for 0."""
     if recordings == 1:
         return "; no 95 % intervals: all worlds come from one recording"
     return f"; 95 % intervals by {recordings:,} recordings" if recordings else ""

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.infos import WORLD, numbers
@@ -79,10 +80,11 @@ class Stream(NamedTuple):
 
         ``state``: state of these worlds.
         """
-        seed = self.seed if isinstance(self.seed, int) else np.asarray(self.seed)[rows]
-        return (
-            seed if self.option_worlds is None else np.where(state.clock[:, NUMBER] < 0.0, self.option_worlds[1], seed)
-        )
+        seed = self.seed if isinstance(self.seed, int) else exact_array(self.seed)[rows]
+        if self.option_worlds is None:
+            return seed
+        is_of_options = state.clock[:, NUMBER] < 0.0
+        return exact_array(np.where(is_of_options, self.option_worlds[1], np.asarray(seed, object)).tolist())
 
     def describe(self, state: State) -> dict[str, Any]:
         """Drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
@@ -126,6 +128,16 @@ class Stream(NamedTuple):
         drawn_worlds = self.scenario.draw(n, listed_world["seed"], first=listed_world["number"])
         drawn_worlds.worlds.clock[:, NUMBER] = FIRST_IN_LIST - drawn_worlds.worlds.clock[:, NUMBER]
         return drawn_worlds, int(listed_world["seed"])
+
+
+def exact_array(values: Sequence[int]) -> NDArray[Any]:
+    """Whole numbers without rounding: int64, else uint64, else objects. (numpy makes floats of 1 and 2**63.)"""
+    for kind in (np.int64, np.uint64):
+        try:
+            return np.array(values, kind)
+        except OverflowError:
+            continue
+    return np.array(values, object)
 
 
 def chosen_seed(seed: int | None) -> int:

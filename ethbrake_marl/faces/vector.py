@@ -17,7 +17,7 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.faces.gymnasium import OneLearner
 from ethbrake_marl.faces.rendering import render_metadata
 from ethbrake_marl.faces.spaces import checked_actions
-from ethbrake_marl.faces.stream import Stream
+from ethbrake_marl.faces.stream import Stream, exact_array
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.open_game import AnyScenario
 
@@ -84,7 +84,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         stream, state = self.stream.reset(self.num_envs, seed, options)
         answer = self._observe(state), with_masks(self._columns(stream, state, None))
         self._keep(stream, state, self.renderer.began)
-        super().reset(seed=None if seed is None else int(np.ravel(stream.seed)[0]))
+        super().reset(seed=None if seed is None else stream.seed if isinstance(stream.seed, int) else stream.seed[0])
         return answer
 
     def step(self, actions: Any) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
@@ -104,7 +104,12 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
             stream, new = stream.next_episodes(rows)
             observations[rows] = self._observe(new)
             for name, column in self._columns(stream, new, None, rows).items():
-                infos[name][rows] = column
+                if name == "world_seed":
+                    seeds = infos[name].astype(object)
+                    seeds[rows] = column
+                    infos[name] = exact_array(seeds.tolist())
+                else:
+                    infos[name][rows] = column
             state = state.put(rows, new, donate=self.render_mode is None)
         self._keep(stream, state, self.renderer.stepped)
         return observations, self._rewards(step)[:, 0], step.terminated, step.truncated, infos

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
+import warnings
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +14,7 @@ from uuid import uuid4
 
 from filelock import FileLock, Timeout
 
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, NoLocks
 
 # beginning and end of a temporary name; it does not contain the target's name, because names have a maximum length
 _HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"
@@ -33,7 +35,9 @@ def new_file(path: Path) -> Iterator[Path]:
         with partial.open("rb+") as file:  # Windows cannot flush a file that is open for reading only
             os.fsync(file.fileno())
         os.replace(partial, path)
-    except BaseException:
+    except BaseException as error:
+        if isinstance(error, OSError):
+            error.filename = str(path)
         partial.unlink(missing_ok=True)
         raise
 
@@ -118,9 +122,17 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def remove_folder(path: Path) -> None:
-    """Delete a folder. The folder is renamed first, so an interruption leaves no half-deleted folder at ``path``."""
+    """Delete a folder. The folder is renamed first, so an interruption leaves no half-deleted folder at ``path``.
+
+    On overlayfs a folder of a lower layer cannot be renamed, and is deleted in place.
+    """
     aside = _temporary(path.parent)
-    path.rename(aside)
+    try:
+        path.rename(aside)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise
+        aside = path
     shutil.rmtree(aside)
 
 
@@ -140,8 +152,8 @@ def remove_unfinished(folder: Path) -> None:
 def hold_lock(lock: Path, message: str) -> Iterator[None]:
     """Hold the lock file ``lock`` during the block. The lock is also released if the process ends.
 
-    Raises ``InvalidInput`` with the text ``message`` if another process holds the lock, or if the file cannot be
-    locked.
+    Warns on a file system without locks. Raises ``InvalidInput`` with the text ``message`` if another process holds the
+    lock, or if the file cannot be locked.
     """
     held = FileLock(lock, blocking=False, mode=0o666)
     try:
@@ -149,7 +161,11 @@ def hold_lock(lock: Path, message: str) -> Iterator[None]:
     except Timeout:
         raise InvalidInput(f"{lock.parent}: {message}") from None
     except OSError as error:
-        raise InvalidInput(f"{lock}: cannot be used as a lock ({error.strerror}); delete this file") from None
+        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+            raise InvalidInput(f"{lock}: cannot be used as a lock ({error.strerror}); delete this file") from None
+        warnings.warn(
+            f"{lock.parent}: the file system has no locks; run one process at a time here", NoLocks, stacklevel=3
+        )
     try:
         yield
     finally:

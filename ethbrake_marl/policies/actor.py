@@ -14,10 +14,7 @@ BLOCK_ROWS = 256  # observations computed together: outputs of a layer then fit 
 
 
 class Actor:
-    """Computes the deterministic actions of a policy, each observation independently of the others.
-
-    ``tensors``: weights and biases, with the names and shapes of ``spec.tensors``.
-    """
+    """Computes the deterministic actions of a policy, each observation independently of the others."""
 
     def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s]) -> None:
         self.spec = spec
@@ -59,7 +56,6 @@ class Actor:
 
 
 def check_observations(observations: Float32s, size: int) -> None:
-    """Raise ``InvalidInput`` unless observations have the shape [n, ``size``] and are finite float32 numbers."""
     if observations.ndim != 2 or observations.shape[1] != size or observations.dtype != np.float32:
         raise InvalidInput(
             f"observation: has type {observations.dtype} and shape {observations.shape}; needs type float32 and shape"

@@ -47,7 +47,6 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
 
 def _read_manifest(file: Path) -> Manifest:
-    """Manifest in a file. Raises ``CorruptBundle`` if its content is damaged, edited or does not fit this package."""
     try:
         content, manifest = read_json_model(_read(file), Manifest)
     except ValueError as error:
@@ -67,7 +66,7 @@ def _read(file: Path) -> bytes:
 
 
 def _bundle_in(path: Path) -> Path:
-    """Folder of the bundle at ``path`` or ``path/policy``. Raises ``InvalidInput`` if there is none or several."""
+    """Folder of the bundle at ``path`` or ``path/policy``."""
     folders = [folder for folder in (path, path / "policy") if os.path.isdir(folder)]  # no errors
     for folder in folders:
         if LIMITS_BYTES.keys() & set(os.listdir(folder)):
@@ -99,11 +98,7 @@ def load_named_policy(name: str) -> Policy:
 
 
 def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], *, replace: bool = False) -> None:
-    """Write the policies of learners, vehicle -> policy: one bundle if all share a policy, else one folder per vehicle.
-
-    Raises ``AlreadyExists`` for an existing folder; with ``replace`` that folder is deleted once the new one is
-    complete.
-    """
+    """Write the policies of learners, vehicle -> policy: one bundle if all share one, else one folder per vehicle."""
     first = next(iter(drivers.values()))
     if all(policy is first for policy in drivers.values()) and tuple(drivers) == first.manifest.learners:
         first.save(folder, replace=replace)
@@ -114,10 +109,7 @@ def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], 
 
 
 def load_drivers(folder: str | os.PathLike[str]) -> dict[str, Policy]:
-    """Policies in a folder that ``save_drivers`` wrote, vehicle -> policy, front to rear.
-
-    Raises the errors of ``load_policy``.
-    """
+    """Policies in a folder that ``save_drivers`` wrote, vehicle -> policy, front to rear."""
     path = Path(folder)
     names = sorted((place.name for place in path.glob("vehicle_[1-9]*")), key=lambda name: (len(name), name))
     if names:

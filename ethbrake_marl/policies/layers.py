@@ -22,10 +22,7 @@ CUBIC_BELOW = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
 
 
 def layers_of(tensors: Mapping[str, Float32s], name: str, hidden: int) -> Layers:
-    """Weight and bias of each layer, from the tensors ``name.0.weight`` to ``name.output.bias``.
-
-    ``hidden``: number of hidden layers.
-    """
+    """Weight and bias of each layer, the output layer last."""
     names = [f"{name}.{k}" for k in range(hidden)] + [f"{name}.output"]
     return [
         (np.ascontiguousarray(tensors[f"{layer}.weight"]), np.ascontiguousarray(tensors[f"{layer}.bias"]))

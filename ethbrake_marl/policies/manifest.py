@@ -32,7 +32,7 @@ version_of = cache(version)  # reading one takes a millisecond
 
 
 def installed_versions() -> dict[str, str]:
-    """Versions of Python, the physics, and every package that may affect a training, name -> version."""
+    """Versions of everything that may affect a training, name -> version."""
     core_versions = {"python": platform.python_version(), PHYSICS_KEY: physics_digest()}
     return core_versions | {name: version_of(name) for name in POLICY_PACKAGES} | versions_used()
 

@@ -43,7 +43,7 @@ class FiniteModel(FileModel):
 
 
 class FeatureDefinition(FiniteModel):
-    """A feature that is computed by a registered function, as it was when the policy was trained."""
+    """A feature that is computed by a registered function, as it was in training."""
 
     name: Annotated[str, Field(max_length=64)]
     of: Of
@@ -85,10 +85,8 @@ class ObservationSchema(FiniteModel):
         )  # fmt: skip
 
     def check(self, where: Path, version: str) -> None:
-        """Raise an error unless every feature is the same as in training.
-
-        ``version``: version of this package in training. Raises ``InvalidInput`` if a user's feature is missing or has
-        changed, and ``CorruptBundle`` if a feature of this package has changed.
+        """Raise an error unless every feature is the same as in training: ``InvalidInput`` for a user's feature,
+        ``CorruptBundle`` for a feature of this package. ``version``: of this package in training.
         """
         for old in self.registered:
             observes = f"{where}: the policy observes the feature {old.name!r:.80}"
@@ -125,7 +123,7 @@ def _is_built_in(entry: ComputedFeature) -> bool:
 
 
 def _trial_values(entry: ComputedFeature) -> tuple[float, ...]:
-    """Values of a feature in some trial worlds: in one world if this package defines the feature, else in three."""
+    """Values of a feature in the trial worlds: in one world if this package defines the feature, else in three."""
     state = _trial_worlds()
     if _is_built_in(entry):
         state = state.take(slice(1))

@@ -67,9 +67,8 @@ class Policy:
 
     @classmethod
     def make(cls, tensors: Mapping[str, Float32s], *, network: NetworkSpec, observation: View, **manifest: Any) -> Self:
-        """Policy with these tensors. ``manifest``: all fields of ``Manifest`` except hashes and versions.
-
-        Raises ``InvalidInput`` that names the invalid tensor or field.
+        """Policy with these tensors. ``manifest``: all fields of ``Manifest`` except hashes and versions. Raises
+        ``InvalidInput``.
         """
         data = serialise(tensors)
         try:
@@ -86,18 +85,14 @@ class Policy:
             raise InvalidInput(f"policy: {reason}") from None
 
     def with_range(self, training_range: TrainingRange | None) -> Self:
-        """Policy with this range. Raises pydantic's ``ValidationError`` if the range does not fit."""
+        """Policy with this range. Raises pydantic's ``ValidationError``."""
         content = {**self.manifest.model_dump(), "training_range": training_range and training_range.model_dump()}
         manifest = Manifest.model_validate(content)
         sha256 = _manifest_sha256(manifest)
         return replace(self, manifest=manifest.model_copy(update={"manifest_sha256": sha256}))
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
-        """Write the bundle as a new folder, completely or not at all.
-
-        Raises ``AlreadyExists`` for an existing folder; with ``replace`` that folder is deleted once the new one is
-        complete.
-        """
+        """Write the bundle as a new folder, completely or not at all. Raises ``AlreadyExists``, unless ``replace``."""
         manifest = self.manifest.model_copy(update={"manifest_sha256": _manifest_sha256(self.manifest)})
         with new_folder(Path(folder).expanduser(), replace=replace) as partial:
             write_file(partial / WEIGHTS, serialise(self.tensors))
@@ -115,7 +110,7 @@ def serialise(tensors: Mapping[str, Float32s]) -> bytes:
 def checked_tensors(data: bytes, network: NetworkSpec) -> dict[str, Float32s]:
     """Read-only tensors in the content of a safetensors file, name -> tensor.
 
-    Raises ``ValueError`` for a tensor with a wrong name, shape or type, or with an entry that is not finite.
+    Raises ``ValueError`` for a wrong name, shape or type, and for an entry that is not finite.
     """
     try:
         tensors = safetensors.numpy.load(data)

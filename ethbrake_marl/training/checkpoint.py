@@ -145,7 +145,7 @@ def read(path: Path) -> dict[str, Any]:
             saved = torch.load(stream, weights_only=True)
         except Exception as error:  # zipfile and torch raise many kinds for a file that is not theirs
             raise CorruptBundle(f"{path}: is damaged ({' '.join(str(error).split()):.200})") from None
-    if damaged or not isinstance(saved, dict) or saved.keys() != CHECKPOINT_KEYS:
+    if damaged or not isinstance(saved, dict) or saved.keys() != CHECKPOINT_KEYS or type(saved["steps"]) is not int:
         raise CorruptBundle(f"{path}: is damaged, or not a checkpoint")
     return saved
 

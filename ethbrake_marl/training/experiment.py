@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import Team
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.evaluate import EPISODES, SEED, evaluate
 from ethbrake_marl.evaluation.measure_registry import MEASURES
@@ -85,13 +85,15 @@ def run_experiment(
     settings: Sequence[str] = (),
     report: ReportWriter | None = None,
     on_progress: OnProgress | None = None,
+    on_unwritten: Callable[[OSError | EthBrakeError], None] | None = None,
 ) -> tuple[Experiment, Sequence[Any], str]:
     """Train, compare, and write ``results.json``, ``worlds.csv`` and a report into the run's folder.
 
     ``train_on``: scenario of the training; None: ``scenario``, in which the agents are compared. Optimising agents
     minimise the count of harm used in training (``reward.harm_count``). Ctrl-C stops the training after the current
     update, and the policy so far is compared; a second Ctrl-C raises ``KeyboardInterrupt``. Other arguments and errors
-    are as in ``train`` and ``evaluate``.
+    are as in ``train`` and ``evaluate``. ``on_unwritten`` is called if results or report cannot be written; None: the
+    error is raised.
 
     Returns the experiment, and the tables and text of the report. Raises ``InvalidInput`` at once for a scenario
     without exact impacts, which shields and reports need.
@@ -113,21 +115,29 @@ def run_experiment(
         recipe, train_on or scenario, directory, steps=steps, seed=seed, force=force, settings=settings,
         on_progress=on_progress,
     )  # fmt: skip
-    with RunFolder(trained.directory).stage("evaluation", trained.status):
-        note = ""
-        if trained.status == "interrupted":
-            note = (
-                f"training interrupted after {trained.steps:,} steps; now evaluating the policy so far (press Ctrl-C"
-                " again to stop immediately)"
-            )
-        tell(Progress("evaluation", 0, episodes, note=note))
-        compared = Comparison.of(
-            scenario, compared_teams(trained, scenario, count, baselines), episodes=episodes, seed=list_seed,
-            harm_count=count, measures=measures, on_done=lambda worlds: tell(Progress("evaluation", worlds, episodes)),
-        )  # fmt: skip
-        write_results(trained.directory, compared.table, compared.result, "csv", force=True)
-        experiment = Experiment(trained, compared, measures, started)
-        tables, where = writer.write(experiment, tell)
+    experiment = None
+    try:
+        with RunFolder(trained.directory).stage("evaluation", trained.status):
+            note = ""
+            if trained.status == "interrupted":
+                note = (
+                    f"training interrupted after {trained.steps:,} steps; now evaluating the policy so far (press"
+                    " Ctrl-C again to stop immediately)"
+                )
+            tell(Progress("evaluation", 0, episodes, note=note))
+            compared = Comparison.of(
+                scenario, compared_teams(trained, scenario, count, baselines), episodes=episodes, seed=list_seed,
+                harm_count=count, measures=measures,
+                on_done=lambda worlds: tell(Progress("evaluation", worlds, episodes)),
+            )  # fmt: skip
+            experiment = Experiment(trained, compared, measures, started)
+            write_results(trained.directory, compared.table, compared.result, "csv", force=True)
+            tables, where = writer.write(experiment, tell)
+    except (OSError, EthBrakeError) as error:
+        if experiment is None or on_unwritten is None:
+            raise
+        on_unwritten(error)
+        tables, where = experiment.compared.table.tables(), f"policy: {trained.directory}"
     return experiment, tables, where
 
 

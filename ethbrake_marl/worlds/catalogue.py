@@ -20,6 +20,8 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 FOLDERS: dict[str, Path] = {}  # registered folders: path as text -> path
 
+DEEPEST = 50  # largest number of files that are based on each other
+
 THREE_TESTS = ("paper-random", "paper-random-brake-only", "paper-random-obstacle")
 
 
@@ -177,6 +179,8 @@ def _load_below(what: str, path: Path, above: tuple[Path, ...]) -> Scenario:
     if path.resolve() in places:
         circle = " -> ".join(file.stem for file in (*above[places.index(path.resolve()) :], path))
         raise InvalidInput(f"{what}: {circle} is a circle; base one of them on another scenario")
+    if len(above) == DEEPEST:
+        raise InvalidInput(f"{what}: more than {DEEPEST} files are based on each other; base this one on a nearer one")
     return _load(path, above)
 
 

@@ -17,10 +17,15 @@ if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario
 
 
+LABELS = "labels"  # memory of worlds from a table of the user: name of a column of texts -> [n]
+OF_RESULTS = ("agent", "knows", "world", "hidden", "scenario")  # columns of results, which no label may be called
+
+
 def columns_of(drawn_worlds: DrawnWorlds) -> dict[str, NDArray[np.generic]]:
-    """Table of drawn worlds, column -> [n]: the number ``world``, and columns of ``kinds_of`` and ``quantities_of``."""
-    numbers = drawn_worlds.worlds.clock[:, NUMBER].astype(np.int64)
-    return {"world": numbers, **kinds_of(drawn_worlds), **quantities_of(drawn_worlds.worlds, drawn_worlds.friction)}
+    """Table of drawn worlds, column -> [n]: the number ``world``, labels, ``kinds_of`` and ``quantities_of``."""
+    worlds = drawn_worlds.worlds
+    kinds = {**worlds.memories.get(LABELS, {}), **kinds_of(drawn_worlds)}
+    return {"world": worlds.clock[:, NUMBER].astype(np.int64), **kinds, **quantities_of(worlds, drawn_worlds.friction)}
 
 
 def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str, Floats]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import not_
@@ -123,10 +123,17 @@ class CsvFile(NamedTuple):
         if len(rows) < 2:
             raise InvalidInput(f"{path}: must have a header, for instance gap_1_m,gap_2_m,speed_1_mps,... and rows")
         first, *_ = rows
-        return cls(path, [name.strip() for name in rows.pop(first)], rows)
+        header = [name.strip() for name in rows.pop(first)]
+        for mark, what in ((";", "semicolons"), ("\t", "tabs")):
+            if len(header) == 1 and mark in header[0]:
+                raise InvalidInput(
+                    f"{path}, line {first}: columns are separated by {what}; separate them by commas, and write"
+                    " decimals with a point (in Excel: save as CSV with English number formats)"
+                )
+        return cls(path, header, rows)
 
-    def cells(self, columns: Sequence[str]) -> list[list[float | str]]:
-        """Cells of ``columns``, row by row: numbers, but texts in the column ``recording``.
+    def cells(self, columns: Sequence[str], texts_in: Collection[str] = (RECORDING,)) -> list[list[float | str]]:
+        """Cells of ``columns``, row by row: numbers, but texts in the columns ``texts_in``.
 
         Raises ``InvalidInput`` for a row of another length than the header, and for a text that is not a number.
         """
@@ -137,7 +144,7 @@ class CsvFile(NamedTuple):
                     f"{self.path}, line {line}: has {len(row)} values, but the header has {len(self.header)} columns"
                 )
             texts = dict(zip(self.header, map(str.strip, row), strict=True))
-            numbers = {name: parse_numeral(texts[name]) for name in columns if name != RECORDING}
+            numbers = {name: parse_numeral(texts[name]) for name in columns if name not in texts_in}
             if bad := [name for name, number in numbers.items() if number is None]:
                 raise InvalidInput(f"{self.path}, line {line}, column {bad[0]}: {texts[bad[0]]!r:.60} is not a number")
             cells.append([{**texts, **numbers}[name] for name in columns])

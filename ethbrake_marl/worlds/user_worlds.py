@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -18,6 +19,7 @@ from ethbrake_marl.files.model import suggestion
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.derived import mistakes, obstacle_gap, world_values
+from ethbrake_marl.worlds.describe import LABELS, OF_RESULTS
 from ethbrake_marl.worlds.open_game import AnyScenario
 from ethbrake_marl.worlds.quantities import OPTIONAL, QUANTITIES, USUAL, QuantityEntry, table_columns
 from ethbrake_marl.worlds.sampling import state_of
@@ -50,8 +52,9 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     """Worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
 
     ``columns`` may also be a pandas or polars data frame, a pyarrow table or a structured array of numpy; rows are
-    matched by position. A missing column (of ``world_columns``) takes the scenario's value, which must be fixed. Raises
-    ``InvalidInput``, with column and row (from 0), for a bad value.
+    matched by position. A missing column (of ``world_columns``) takes the scenario's value, which must be fixed. A
+    column with another name is a label: results have it as text. Raises ``InvalidInput``, with column and row (from 0),
+    for a bad value, and for a name that is like that of a quantity.
     """
     scenario, where = load_scenario(scenario), "initial states"
     columns = columns.collect() if callable(getattr(columns, "collect", None)) else columns  # a LazyFrame of polars
@@ -72,24 +75,33 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
         )
     header = [str(name) for name in names]
     entries = _entries(header, scenario, where)
-    arrays = [_numbers(f"{where}: {name}", columns[name]) for name in names]
+    arrays = [
+        np.array(["" if _is_missing(cell) else str(cell) for cell in columns[name]])
+        if str(name) not in entries
+        else _numbers(f"{where}: {name}", columns[name])
+        for name in names
+    ]
     if len({array.shape for array in arrays}) != 1 or arrays[0].ndim != 1:
         shapes = ", ".join(f"{name} {list(array.shape)}" for name, array in zip(header, arrays, strict=True))
         raise InvalidInput(f"{where}: all columns must be lists of the same length; they have the shapes {shapes}")
-    return _worlds(scenario, dict(zip(entries, arrays, strict=True)), where, lambda row: f", row {row}")
+    values = {entries[name]: array for name, array in zip(header, arrays, strict=True) if name in entries}
+    labels = {name: array for name, array in zip(header, arrays, strict=True) if name not in entries}
+    return _with_labels(_worlds(scenario, values, where, lambda row: f", row {row}"), labels)
 
 
 def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
-    """Worlds from a CSV file with the columns of ``worlds_from_table``. Errors name file, line and column."""
+    """Worlds from a CSV file with commas and the columns of ``worlds_from_table``. Errors name file, line, column."""
     if not isinstance(path, str | PathLike):
         raise InvalidInput(
             f"path: type {type(path).__name__}: must be the path of a CSV file; worlds_from_table reads a table"
         )
     scenario, file = load_scenario(scenario), CsvFile.read(Path(path).expanduser())
     entries = _entries(file.header, scenario, f"{file.path}, line 1")
-    table = np.array(file.cells(file.header), np.float64)
-    columns = dict(zip(entries, table.T, strict=True))
-    return _worlds(scenario, columns, str(file.path), lambda row: f", line {[*file.rows][row]}")
+    labels = [name for name in file.header if name not in entries]
+    columns = dict(zip(file.header, zip(*file.cells(file.header, labels), strict=True), strict=True))
+    values = {entry: np.array(columns[name], np.float64) for name, entry in entries.items()}
+    worlds = _worlds(scenario, values, str(file.path), lambda row: f", line {[*file.rows][row]}")
+    return _with_labels(worlds, {name: np.array(columns[name]) for name in labels})
 
 
 def world_keys(scenario: Scenario) -> tuple[str, ...]:
@@ -108,13 +120,27 @@ def _check_known(what: str, name: str, known: Sequence[str]) -> None:
         raise InvalidInput(f"{what}; {suggestion(name, known) or 'known: ' + ', '.join(known)}")
 
 
-def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[QuantityEntry]:
-    possible_columns = world_columns(scenario)
+def _entries(header: Sequence[str], scenario: Scenario, where: str) -> dict[str, QuantityEntry]:
+    """Entry of each column of a quantity, name -> (key, index); the other columns of ``header`` are labels."""
+    possible_columns, of_all_scenarios = world_columns(scenario), table_columns(USUAL + OPTIONAL, scenario.vehicles)
     for name in header:
         if header.count(name) > 1:
             raise InvalidInput(f"{where}: column {name!r} occurs twice")
-        _check_known(f"{where}: unknown column {name!r}", name, [*possible_columns])
-    return [possible_columns[name] for name in header]
+        if name in OF_RESULTS or not name.isprintable() or not name:
+            raise InvalidInput(
+                f"{where}: column {name!r:.60}: a column of your own needs another name, which results do not use"
+            )
+        if name in of_all_scenarios or suggestion(name, possible_columns):
+            _check_known(f"{where}: unknown column {name!r}", name, [*possible_columns])
+    return {name: possible_columns[name] for name in header if name in possible_columns}
+
+
+def _with_labels(worlds: State, labels: Mapping[str, NDArray[Any]]) -> State:
+    return worlds._replace(memories={**worlds.memories, LABELS: dict(labels)}) if labels else worlds
+
+
+def _is_missing(cell: Any) -> bool:
+    return cell is None or type(cell).__name__ == "NAType" or (isinstance(cell, float) and math.isnan(cell))
 
 
 def _worlds(
@@ -200,7 +226,7 @@ def _numbers(what: str, value: Any) -> Floats:
 
 def _number(cell: Any) -> float:
     """One object as a number; NaN for a missing number, which may be None or the ``NAType`` of pandas."""
-    if cell is None or type(cell).__name__ == "NAType":
+    if _is_missing(cell):
         return math.nan
     if isinstance(cell, bool) or not isinstance(cell, Real | Decimal):
         raise TypeError(f"it contains {cell!r:.60}")

@@ -6,6 +6,7 @@ import copy
 import pickle
 import warnings
 from collections import deque
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ import gymnasium
 import numpy as np
 import pytest
 import stable_baselines3 as stable
-import supersuit
 import torch
 from gymnasium import wrappers
 from gymnasium.spaces import Box, Discrete
@@ -244,14 +244,20 @@ def test_agent__can_be_pickled_where_its_policy_can() -> None:
 # ---------------------------------------------------------------- what it observes
 
 
+def copies(make: Callable[[Any], Any]) -> Any:
+    """Two copies of an environment, by SuperSuit, which Python 3.13 does not have."""
+    supersuit = pytest.importorskip("supersuit")
+    return supersuit.concat_vec_envs_v1(
+        supersuit.pettingzoo_env_to_vec_env_v1(make(supersuit)), 2, base_class="stable_baselines3"
+    )
+
+
 AROUND: dict[str, Any] = {
     "rows": lambda features: rows(observation=features),
     "DummyVecEnv": lambda features: vec_env.DummyVecEnv([lambda: Monitor(EthBrakeEnv(observation=features))]),
     "VecNormalize": lambda features: vec_env.VecNormalize(rows(observation=features)),
-    "SuperSuit": lambda features: supersuit.concat_vec_envs_v1(
-        supersuit.pettingzoo_env_to_vec_env_v1(EthBrakeParallelEnv(agents="learners", observation=features)),
-        2,
-        base_class="stable_baselines3",
+    "SuperSuit": lambda features: copies(
+        lambda supersuit: EthBrakeParallelEnv(agents="learners", observation=features)
     ),
 }
 
@@ -314,10 +320,8 @@ CHANGING: dict[str, Any] = {
     "TimeLimit": lambda: TimeLimit(EthBrakeEnv()),
     "OwnEnv": OwnEnv,
     "VecFrameStack": lambda: vec_env.VecFrameStack(rows(), 1),
-    "FrameStackModifier": lambda: supersuit.concat_vec_envs_v1(
-        supersuit.pettingzoo_env_to_vec_env_v1(supersuit.frame_stack_v1(EthBrakeParallelEnv(agents="learners"), 1)),
-        2,
-        base_class="stable_baselines3",
+    "FrameStackModifier": lambda: copies(
+        lambda supersuit: supersuit.frame_stack_v1(EthBrakeParallelEnv(agents="learners"), 1)
     ),
 }
 

@@ -109,7 +109,7 @@ def test_program__exit_status_and_streams_and_a_full_disk_behind_stdout() -> Non
     status, out, err = program(calling.format("evalute", ""))
     assert (status, out, err.count("\n")) == (2, "", 1)
     full = program(calling.format("--version", " os.dup2(os.open('/dev/full', os.O_WRONLY), 1);"))
-    assert full == (2, "", "ethbrake: error: output: No space left on device\n")
+    assert full == (3, "", "ethbrake: error: output: No space left on device\n")
 
 
 @pytest.mark.parametrize("encoding", [pytest.param("latin-1", marks=pytest.mark.slow), "ascii"])

@@ -1,6 +1,7 @@
 """How a command ends: its exit status, where its output goes or cannot go, and Ctrl-C."""
 
 import builtins
+import errno
 import io
 import os
 import shlex
@@ -12,6 +13,7 @@ from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import NoReturn
+from unittest.mock import Mock
 
 import pytest
 import typer
@@ -92,8 +94,8 @@ def ended(line: str, streams: str) -> tuple[int, str, list[str]]:
 
 @pytest.mark.parametrize("line", ["--help", *(pytest.param(each, marks=pytest.mark.slow) for each in LINES)])
 def test_result_that_cannot_be_written__is_an_error_of_one_line(line: str) -> None:
-    assert ended(line, ">&-") == (2, "", ["ethbrake: error: output: not writable"])
-    assert ended(line, ">/dev/full") == (2, "", ["ethbrake: error: output: No space left on device"])
+    assert ended(line, ">&-") == (3, "", ["ethbrake: error: output: not writable"])
+    assert ended(line, ">/dev/full") == (3, "", ["ethbrake: error: output: No space left on device"])
 
 
 @pytest.mark.parametrize("line", ["agent list", pytest.param(COAST, marks=pytest.mark.slow)])
@@ -101,6 +103,18 @@ def test_message_that_cannot_be_written__loses_no_result(line: str) -> None:
     for streams in ("2>&-", "2>/dev/full", "<&-"):
         status, out, told = ended(line, streams)
         assert (status, told) == (0, []) and "coast" in out
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+@pytest.mark.parametrize("more", [[], ["--per-world", "csv"], ["--report"]])
+def test_result__is_printed_although_its_files_cannot_be_written(
+    more: list[str], form: list[str], ethbrake: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
+    answer = ethbrake(*COAST.split(), *form, *more, "--output", str(tmp_path / "new"))
+    assert answer.status == 3 and "coast" in answer.out and [*(tmp_path / "new").iterdir()] == []
+    last = answer.err.splitlines()[-1]
+    assert last.startswith(f"ethbrake: error: {tmp_path}/new/") and last.endswith(": No space left on device")
 
 
 def test_result_in_a_file__may_have_no_stdout(tmp_path: Path) -> None:
@@ -158,6 +172,33 @@ def test_ctrl_c__is_one_line_and_status_130_even_inside_exec(tmp_path: Path) -> 
     (tmp_path / "slow.py").write_text(AGENT.format(code='print("begun", flush=True); time.sleep(60)'))
     line = [*RUN, "evaluate", "--agents", f"{tmp_path}/slow.py:make"]
     assert interrupted("begun", 0.0, line) == (130, ["interrupted; nothing was written"])
+
+
+IN_LLVM = """
+import signal, sys
+import numba
+
+def interrupt(frame, happened, argument):
+    if frame.f_code.co_name == "_raw_object_cache_notify" and happened == "call":
+        sys.setprofile(None)
+        print("begun", flush=True)
+        signal.raise_signal(signal.SIGINT)
+
+def make():
+    sys.setprofile(interrupt)
+    numba.njit(lambda x: x / 3.0)(6.0)
+    while True:
+        pass
+"""
+
+
+def test_ctrl_c_in_a_function_that_llvm_calls__is_not_lost(tmp_path: Path) -> None:
+    """Python ignores exceptions of such a function."""
+    (tmp_path / "slow.py").write_text(IN_LLVM)
+    line = [*RUN, "evaluate", "--agents", f"{tmp_path}/slow.py:make"]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
+    lines = [each for each in done.stderr.splitlines() if " of " not in each and each != "begun"]
+    assert (done.returncode, lines) == (130, ["interrupted; nothing was written"])
 
 
 @pytest.mark.slow

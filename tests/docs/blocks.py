@@ -4,10 +4,12 @@ Python blocks of a page share their names. Commands run in this process, in a sh
 shows what they print; targets of make and installations are only checked. A block without a language shows what the
 block above prints, as do the lines below a command in a ``console`` block and the comment behind ``print(...)``;
 ``...`` stands for any text. A block of YAML is a scenario, a recipe, or keys of the scenario ``paper-random``.
+Without ``--all`` only the first block of code that can run is run, and of several commands the first; the others are
+parsed.
 
 A comment before a block, ``<!-- block: MARK; MARK -->``, says what is different with it:
 
-- ``slow``: run only with ``--all``, and parsed without.
+- ``slow``: never the first block, because it takes more than a few seconds.
 - ``not run: REASON``: only parsed: the options of its commands exist.
 - ``needs PACKAGE``: run where this package is installed, and parsed elsewhere.
 - ``short A=B C=D``: run with B in place of A; its commands in their short form although the page shows what they print.
@@ -63,7 +65,6 @@ SHORT = {  # what is added to a command, the first that fits: the last value of 
     "ethbrake reproduce": "--list",
     "ethbrake study ablate": "--steps 1 --episodes 4 --search-episodes 2 --seeds 1",
     "ethbrake study front": "--episodes 2 --steps 1 --budget 20",
-    "ethbrake study falsify": "--budget 20",
     "python train/ippo.py": "--steps 200 --copies 2 --rollout 60",
     "python train/benchmark/run.py": "--seeds 1 --jobs 1 --decisions 100 --episodes 5",
     "python train/tune.py": "--trials 1 --jobs 1 --set total_steps=1 evaluation.worlds=10",
@@ -123,10 +124,11 @@ def _marks(place: str, comment: str) -> dict[str, str]:
 
 
 class Reader:
-    """Follows a page in the current folder. ``reads_slow``: blocks with the mark ``slow``, too."""
+    """Follows a page in the current folder. ``reads_all``: runs every block; otherwise the first that is not slow."""
 
-    def __init__(self, reads_slow: bool) -> None:
-        self.reads_slow = reads_slow
+    def __init__(self, reads_all: bool) -> None:
+        self.reads_all = reads_all
+        self.has_run = False
         self.names: dict[str, Any] = {"__name__": "my_file"}
         self.printed: str | None = None  # by the last block of code; None if it was not run
         shutil.copytree(ROOT / "train", "train")
@@ -136,12 +138,12 @@ class Reader:
         marks = block.marks
         if "write" in marks:
             Path(marks["write"]).write_text(block.text)
-        elif "show" in marks:
-            check_output(block.place, block.text, columns_of(Path(marks["show"]), block.text))
-        elif "change" in marks:
-            change(Path(marks["change"]), block)
+        elif {"show", "change"} & marks.keys():
+            if self.reads_all:
+                check_file(block)
         elif not block.language:
-            assert self.runs(block) == (self.printed is not None), f"{block.place}: shows output of no block"
+            has_output = self.runs(block) if self.reads_all else self.printed is not None
+            assert has_output == (self.printed is not None), f"{block.place}: shows output of no block"
             if self.printed is not None:
                 check_output(block.place, block.text, self.printed, marks.get("except", ""))
         elif block.language == "python":
@@ -160,7 +162,7 @@ class Reader:
             assert block.language in NO_CODE, f"{block.place}: nothing runs a block of {block.language!r}"
 
     def runs(self, block: Block) -> bool:
-        skipped = "not run" in block.marks or ("slow" in block.marks and not self.reads_slow)
+        skipped = "not run" in block.marks or (not self.reads_all and (self.has_run or "slow" in block.marks))
         return not skipped and ("needs" not in block.marks or find_spec(block.marks["needs"]) is not None)
 
     def run_python(self, block: Block) -> None:
@@ -169,7 +171,7 @@ class Reader:
         if self.runs(block):
             with contextlib.redirect_stdout(output):
                 exec(code, self.names)
-            self.printed = output.getvalue()
+            self.printed, self.has_run = output.getvalue(), True
             if comments := re.findall(r"(?m)^ *print\(.*\)  # (.*)$", block.text):
                 check_output(block.place, f"...{'...'.join(comments)}...", self.printed)
 
@@ -177,11 +179,13 @@ class Reader:
         self.printed = "" if self.runs(block) else None
         for line, shown in commands(block.code, has_prompt=block.language == "console"):
             words, whole = shlex.split(line, comments=True), "short" not in block.marks and (shown or block.is_shown)
-            if self.printed is None or not is_run(words, bool(whole)):
+            follows = not self.reads_all and self.has_run and not (shown or block.is_shown)
+            if self.printed is None or follows or not is_run(words, bool(whole)):
                 parse(words)
                 continue
             printed = run(words if whole else words + short_form(words), fails=shown.startswith("ethbrake: error: "))
             self.printed += printed
+            self.has_run = True
             if shown:
                 check_output(block.place, shown, printed, block.marks.get("except", ""))
 
@@ -207,6 +211,14 @@ def check_output(place: str, shown: str, printed: str, left_out: str = "") -> No
     )
     alike = doctest.OutputChecker().check_output(want, got, doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
     assert alike, f"{place}\n" + "\n".join(difflib.unified_diff(want.splitlines(), got.splitlines(), "page", "printed"))
+
+
+def check_file(block: Block) -> None:
+    """Compare a file with a block that shows it, or change it as the block says."""
+    if "show" in block.marks:
+        check_output(block.place, block.text, columns_of(Path(block.marks["show"]), block.text))
+    else:
+        change(Path(block.marks["change"]), block)
 
 
 def columns_of(file: Path, shown: str) -> str:
@@ -309,6 +321,8 @@ def parse(words: list[str]) -> None:
         check_target(rest)
     elif is_python(program) and rest[0].endswith(".py"):
         parse_script(rest)
+    elif program == "cp":
+        assert len(rest) == 2, f"{shlex.join(words)}: a file and a file"
     elif program == "pip" or rest[:2] == ["-m", "pip"]:
         extras = {extra for word in rest for listed in re.findall(r"\[(.*?)\]", word) for extra in listed.split(",")}
         assert extras <= PROJECT["optional-dependencies"].keys(), f"{shlex.join(words)}: unknown extra"

@@ -1,4 +1,4 @@
-"""Every block of every page is run, as tests/docs/blocks.py says."""
+"""Every block of every page is run, as tests/docs/blocks.py says; without ``--all`` one block of each page."""
 
 from pathlib import Path
 
@@ -18,17 +18,17 @@ def test_page__its_blocks_run_and_print_what_it_shows(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(empty_folder))
-    reads_slow = request.config.getoption("all")
-    if not reads_slow:
+    reads_all = request.config.getoption("all")
+    if not reads_all:
         monkeypatch.delitem(COMPARED, "best known", raising=False)  # a search, in `scenario validate`
-    reader = Reader(reads_slow)
+    reader = Reader(reads_all)
     for block in blocks(page):
         reader.read(block)
 
 
 def read(page: Path, text: str) -> None:
     page.write_text(text)
-    reader = Reader(reads_slow=True)
+    reader = Reader(reads_all=True)
     for block in blocks(page):
         reader.read(block)
 

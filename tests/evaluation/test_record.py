@@ -9,16 +9,15 @@ import pytest
 
 from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.team import Team, play_to_end
-from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
+from ethbrake_marl.evaluation.evaluate import evaluate
+from ethbrake_marl.evaluation.record import EpisodeRecord, record_agents, record_episode
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless
 from tests.refused import refused
 
 
 def recorded(scenario: Any, agent: Any = FULL_BRAKE, number: int = 0, **more: Any) -> EpisodeRecord:
-    loaded, game = open_game(scenario)
-    (body,) = game.settings.learners.tolist()
-    return record_episode(loaded.sample(1, 7, first=number), Team(agent.name, {body: agent}), game, **more)
+    return record_episode(scenario, agent, number=number, **more)
 
 
 def test_record__of_one_impact_by_hand() -> None:
@@ -64,11 +63,44 @@ def test_record__at_the_horizon_is_not_at_rest() -> None:
 
 def test_record__that_is_refused() -> None:
     scenario, game = open_game("paper-random")
-    worlds, team = scenario.sample(2, 7), Team("x", {2: Careless()})
-    with refused("record_episode: world has 2 worlds; pass exactly 1"):
-        record_episode(worlds, team, game)
+    worlds = scenario.sample(2, 7)
+    with refused("record_episode: worlds has 2 worlds; pass exactly 1"):
+        record_episode(worlds, Careless(), scenario=scenario)
     with refused("pass exactly 1 at the alert"):
-        record_episode(game.reset(worlds.take([0])), team, game)
+        record_episode(game.reset(worlds.take([0])), Careless(), scenario=scenario)
+    with refused("a world needs its scenario"):
+        record_episode(worlds.take([0]), Careless())
+    with refused("scenario: is given twice"):
+        record_episode("paper-random", Careless(), scenario=scenario)
+    with refused("means 2 agents; name one agent"):
+        record_episode(scenario, "full_brake,coast")
+    with refused("unknown agent 'full_break'"):
+        record_episode(scenario, "full_break")
     for bad in (0.0, -1.0, np.inf, np.nan, "1"):
         with refused("must be a finite number of seconds above 0"):
-            record_episode(worlds.take([0]), team, game, bad)  # type: ignore[arg-type]
+            record_episode(scenario, Careless(), sample_s=bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "agent",
+    ["full_brake", FULL_BRAKE, {"vehicle_2": FULL_BRAKE}, {"vehicle_2": "full_brake"}, Team("x", {2: FULL_BRAKE})],
+    ids=("name", "agent", "vehicles", "names of vehicles", "team"),
+)
+def test_record__takes_every_description_of_an_agent_and_of_a_world(agent: Any) -> None:
+    scenario = open_game("paper-random")[0]
+    right = scenario.sample(1, 3, first=2)
+    for record in (
+        record_episode("paper-random", agent, number=2, seed=3),
+        record_episode(right, agent, scenario="paper-random"),
+    ):
+        assert record.initial.line.tobytes() == right.line.tobytes()
+        last = evaluate(right, "full_brake", scenario=scenario)["full_brake"]
+        assert record.last.harm("total") == last["total_harm"] and record.time_s[-1] == last["end_s"]
+
+
+def test_records__have_a_row_for_each_agent_of_an_evaluation() -> None:
+    records = record_agents("paper-random", {"hard": "full_brake", "soft": "constant:2"}, number=4)
+    harms = evaluate("paper-random", {"hard": "full_brake", "soft": "constant:2"}, episodes=5)
+    assert {name: record.last.harm("first")[0] for name, record in records.items()} == {
+        name: harms[name]["first_impact_harm"][4] for name in ("hard", "soft")
+    }

@@ -39,7 +39,8 @@ def test_worst_by_hand() -> None:
     assert found.value == 98.0 == pytest.approx(by_hand.value) and found.interval == pytest.approx(by_hand.interval)
     few = worst(np.arange(40.0, 0.0, -1.0))  # 39 and 40; too few values for an interval
     assert few.value == pytest.approx(39.5) and few.interval is None
-    assert worst(np.array([3.0, 9.0])) == Estimate(9.0, None) == worst(np.full(60, 9.0))
+    assert worst(np.array([3.0, 9.0])) == Estimate(9.0, None)
+    assert worst(np.full(200, 9.0)) == Estimate(9.0, None)  # enough values, but none above the quantile
 
 
 def test_worst__covers_the_truth() -> None:
@@ -143,6 +144,15 @@ def test_rate__by_recording_by_hand() -> None:
     assert none.interval == pytest.approx(wilson(0.0, 3 * 3.841458820694124 / T_2**2))
     uneven = rate(np.zeros(15, np.bool_), np.array(["a"] * 13 + ["b", "c"])).interval
     assert uneven is not None and none.interval is not None and uneven[1] > none.interval[1]
+
+
+def test_rate__by_recording_has_at_most_as_many_draws_as_worlds() -> None:
+    # the recordings are hit in 2, 2 and 3 of 5 worlds: 1 + p (1 - p) / error^2 would be 57 draws of 15 worlds
+    truths = np.array([1, 1, 0, 0, 0, 1, 1, 0, 0, 0, 1, 1, 1, 0, 0], np.bool_)
+    names = np.repeat(["a", "b", "c"], 5)
+    share, error = 7 / 15, by_leaving_out(truths.astype(float), np.ones(15), names)
+    assert 1.0 + share * (1.0 - share) / error**2 > 50.0
+    assert rate(truths, names).interval == pytest.approx(wilson(share, 15 * 3.841458820694124 / T_2**2))
 
 
 def drawn(rng: np.random.Generator, groups: int, spread: float, few: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

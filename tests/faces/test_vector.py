@@ -67,6 +67,7 @@ def test_infos__are_those_of_the_single_environment(scenario: Any) -> None:
     for columns, info in pairs:
         assert {name: columns[name][0] for name in info} == info
         assert columns.keys() == info.keys() | {f"_{name}" for name in info}
+        assert all(columns[f"_{name}"].tolist() == [True, True] for name in info)
 
 
 def test_description__has_columns_that_only_some_of_the_worlds_have() -> None:
@@ -147,6 +148,31 @@ def test_seeds__one_for_each_row_give_the_episodes_of_single_environments(scenar
     worlds = many.describe_worlds()
     assert [worlds["gap_1_m"][row] for row in range(3)] == [env.describe_world()["gap_1_m"] for env in singles]
     assert min(infos["world"]) > 0
+
+
+@pytest.mark.parametrize(
+    ("seeds", "kind"),
+    [([2**63 + 1, 3], "uint64"), ([3, 2**64 - 1], "uint64"), ([2**53 + 1, 0], "int64"), ([2**64 + 1, 3], "object")],
+)
+def test_seeds__of_a_list_keep_all_digits(seeds: list[int], kind: str) -> None:
+    env = EthBrakeVectorEnv(2)
+    infos = env.reset(seed=seeds)[1]
+    assert infos["world_seed"].tolist() == seeds and infos["world_seed"].dtype == kind
+    assert env.describe_worlds()["world_seed"].tolist() == seeds
+    options = {"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}
+    assert env.reset(seed=seeds, options=options)[1]["world_seed"].tolist() == [-1, -1]
+    listed = env.reset(seed=seeds, options={"listed_world": {"seed": 2**63 + 5, "number": 0}})[1]
+    assert listed["world_seed"].tolist() == [2**63 + 5] * 2
+
+
+def test_seed__above_63_bits_is_exact_beside_worlds_of_options() -> None:
+    env, over = EthBrakeVectorEnv(2, autoreset_mode="SameStep"), np.zeros(2, bool)
+    state = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
+    env.reset(seed=2**63 + 1, options={"initial_state": state})
+    while not over.any():
+        *_, ended, cut, infos = env.step(np.array([[-1.0], [1.0]]))
+        over = ended | cut
+    assert infos["world_seed"].tolist() == [2**63 + 1 if ended else -1 for ended in over]
 
 
 def test_seeds__one_for_each_row_begin_with_the_first_world() -> None:

@@ -1,18 +1,28 @@
 """Plain files that are read and replaced, YAML, and Python files of the user; refusals: ``test_refusals``."""
 
+import errno
 import math
 import os
 import stat
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, NoLocks
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.python_file import files_run, load_from_file
-from ethbrake_marl.files.store import check_folder, hold_lock, new_folder, remove_unfinished, write_file, write_output
+from ethbrake_marl.files.store import (
+    check_folder,
+    hold_lock,
+    new_folder,
+    remove_folder,
+    remove_unfinished,
+    write_file,
+    write_output,
+)
 from ethbrake_marl.files.yaml import DEPTH_LIMIT, YAML_SIZE_LIMIT, Document, flow_text, parse_yaml
 from tests.refused import refused
 
@@ -79,6 +89,37 @@ def test_lock__is_held_by_one(tmp_path: Path) -> None:
         pass
     with refused("cannot be used as a lock"), hold_lock(tmp_path, "somebody works here"):
         pytest.fail("a folder was locked")
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_lock__on_a_file_system_without_locks_is_a_warning(number: int, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("fcntl.flock", Mock(side_effect=OSError(number, os.strerror(number))))
+    for _ in range(2):
+        with pytest.warns(NoLocks, match="no locks; run one process"), hold_lock(tmp_path / "lock", "busy"):
+            pass
+
+
+def test_folder__that_cannot_be_renamed_is_deleted_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path in ("old", "run", "new"):
+        (tmp_path / path / "inside").mkdir(parents=True)
+    rename = Path.rename
+    crossing = OSError(errno.EXDEV, "Invalid cross-device link")
+    monkeypatch.setattr(
+        Path, "rename", lambda path, to: fail(crossing) if path.name in ("old", "run") else rename(path, to)
+    )
+    remove_folder(tmp_path / "old")
+    with new_folder(tmp_path / "run", replace=True) as partial:
+        (partial / "file").touch()
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == [
+        "new",
+        "new/inside",
+        "run",
+        "run/file",
+    ]
+
+
+def fail(error: OSError) -> None:
+    raise error
 
 
 def test_folder_for_files__takes_files_that_are_new_or_replaced_by_force(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ import errno
 import importlib.util
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import warnings
@@ -12,17 +11,14 @@ from collections.abc import Callable
 from functools import partialmethod
 from importlib.machinery import SourceFileLoader as Loader
 from pathlib import Path
-from types import FrameType
 from typing import NamedTuple
 from unittest.mock import Mock
 
 import numba
 import pytest
-from numba.core import event
 
 from ethbrake_marl import kernel_cache
 from ethbrake_marl.errors import CacheFault
-from ethbrake_marl.interrupts import stop_on_signal
 from ethbrake_marl.motion import compiling
 from tests.fixtures.kernels import OWN, give_own_cache, pytest_collection
 
@@ -241,6 +237,21 @@ def is_of_somebody_else(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getuid", lambda: 12345)
 
 
+def open_to_others(place: str, mode: int = 0o777) -> None:
+    folder = Path(os.environ["NUMBA_CACHE_DIR"], "ethbrake_marl")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / place).chmod(mode)
+
+
+def home_is_open_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    home = Path(os.environ["NUMBA_CACHE_DIR"]).with_name("home")
+    home.mkdir(exist_ok=True)
+    home.chmod(0o775)
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(home))
+
+
 def is_below_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
     file = Path(os.environ["NUMBA_CACHE_DIR"]).with_name("file")
     file.touch()
@@ -256,6 +267,9 @@ OBSTACLES = {
     "below a file": (is_below_a_file, "Not a directory", False),
     "no home": (has_no_home, "no cache folder: HOME and XDG_CACHE_HOME are not set", False),
     "of somebody else": (is_of_somebody_else, "belongs to another user", False),
+    "others can write to it": (lambda m: open_to_others(""), "others can write to it", False),
+    "others can replace it": (lambda m: open_to_others(".."), "others can write to it", False),
+    "others can replace the folder that HOME names": (home_is_open_to_others, "others can write to it", False),
 }
 
 
@@ -282,6 +296,23 @@ def test_cache__that_cannot_be_written(
         assert (answer, compiled, len(warned)) == (42.0, 0 if is_used else 2, not is_used)
         assert all(reason in text and kernel_cache.UNSTORED in text for text in warned)
         assert "None" not in "".join(warned) and {*files_in(tmp_path)} <= before
+
+
+def test_cache__is_made_for_its_user_alone_also_in_a_sticky_folder(ask: Callable, tmp_path: Path) -> None:
+    open_to_others("..", 0o1777)
+    folder_of(tmp_path).rmdir()
+    assert ask() == (42.0, 2, []) and ask() == (42.0, 0, [])
+    assert folder_of(tmp_path).stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("mode", [0o662, 0o664])
+def test_file__that_others_can_write_is_not_run(mode: int, ask: Callable, tmp_path: Path) -> None:
+    ask()
+    for file in folder_of(tmp_path).iterdir():
+        file.chmod(mode)
+    answer, compiled, (warned,) = ask()
+    assert (answer, compiled) == (42.0, 2) and "can be written by others, and is compiled again" in warned
+    assert ask() == (42.0, 0, [])
 
 
 def test_kernel__without_a_source_is_not_stored(ask: Callable, tmp_path: Path) -> None:
@@ -370,32 +401,3 @@ def test_processes_of_xdist__compile_a_kernel_once(tmp_path: Path, monkeypatch: 
     begun = [begin(tmp_path, tmp_path / "cache", before=counted) for _ in range(4)]
     compiled = [process.communicate()[0].startswith("42.0\nCounter({(") for process in begun]
     assert sorted(compiled) == [False, False, False, True]
-
-
-def test_ctrl_c_while_llvm_calls_python__is_no_lost_exception() -> None:
-    """LLVM hands a finished function over by a call of Python, whose exceptions vanish."""
-    thirds = numba.njit(lambda x: x / 3.0)
-    calls = []
-
-    def interrupt(frame: FrameType, happened: str, argument: object) -> None:
-        if frame.f_code.co_name == "_raw_object_cache_notify" and happened == "call" and not calls:
-            calls.append(frame)
-            signal.raise_signal(signal.SIGINT)
-
-    sys.setprofile(interrupt)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            thirds(6.0)
-    finally:
-        sys.setprofile(None)
-    assert calls and thirds(6.0) == 2.0
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_ctrl_c_while_llvm_calls_python__reaches_a_handler_that_does_not_raise() -> None:
-    with stop_on_signal() as stop:
-        event.start_event("numba:compiler_lock")
-        signal.raise_signal(signal.SIGINT)
-        assert not stop()
-        event.end_event("numba:compiler_lock")
-        assert stop()

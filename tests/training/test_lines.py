@@ -136,6 +136,24 @@ def test_metrics__are_means_over_the_worlds_and_costs_relative_to_full_braking()
     assert full_braking(TRAINING)["objective"] == pytest.approx(1.0)
 
 
+def test_metrics__of_lines_with_an_objective_are_relative_to_its_cost() -> None:
+    recipe = TINY.replace(reward={"harm": 1.0, "harm_count": "total", "objective": "own"})
+    training = TRAINING._replace(recipe=recipe)
+    metrics = drive_list(training)(dict.fromkeys(training.learners, eb.make_agent("coast")))
+    ratios = []
+    for line, learners in zip(training.lines, ([2], [3, 5]), strict=True):
+        plan = line.recipe.evaluation
+        result = eb.evaluate(line.scenario, "coast,full_brake", episodes=plan.worlds, seed=plan.seed, measures="own")
+        coasting, braking = (
+            np.mean([result[agent][f"own_total_{body}"].mean() for body in learners])
+            for agent in ("coast", "full_brake")
+        )
+        ratios.append(coasting / braking)
+        harms = [result[agent]["total_harm"].mean() for agent in ("coast", "full_brake")]
+        assert coasting / braking != pytest.approx(harms[0] / harms[1])
+    assert [metrics["relative_paper-random"], metrics["relative_five"]] == pytest.approx(ratios)
+
+
 def test_metrics__of_a_line_without_cost_are_refused() -> None:
     far = MEMBERS[0].replace(name="far", gaps_m=200.0)
     free = LINES.replace(mixture=[{"scenario": far.declared()}, {"scenario": LINES.lines[1].declared()}])

@@ -111,14 +111,15 @@ def test_run__of_a_method_of_ones_own(run: Run, empty_folder: Path, capsys: pyte
     Path("mine.py").write_text(METHOD)
     words = ("benchmark/run", "--tasks", "benchmark-pair", "--methods", "mine.py:train", "--seeds", "2", "--decisions")
     assert run(*words, "50", "--episodes", "30", "--output", "new") == 0
-    rows = rows_of(Path("new/rows.csv"))
+    *rows, braking = rows_of(Path("new/rows.csv"))
+    assert [braking[key] for key in ("method", "agent", "seed", "decisions")] == ["full_brake", "full_brake", "", ""]
     assert [(row["task"], row["method"], row["seed"], row["decisions"]) for row in rows] == [
         ("benchmark-pair", "mine.py:train", "0", "50"), ("benchmark-pair", "mine.py:train", "1", "50"),
     ]  # fmt: skip
-    agents = {brake: f"constant:{brake}" for brake in ("6", "5")}
+    agents = {brake: f"constant:{brake}" for brake in ("6", "5")} | {"full_brake": "full_brake"}
     result = eb.evaluate("benchmark-pair", agents, episodes=30, measures="worst5")
     table = {row.agent: row for row in eb.summarise(result)}
-    for row, brake in zip(rows, agents, strict=True):
+    for row, brake in zip([*rows, braking], agents, strict=True):
         for key in ("honest_cost", "worst5_honest", "collision_rate"):
             assert float(row[key]) == table[brake][key].value
     capsys.readouterr()

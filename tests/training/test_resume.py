@@ -180,6 +180,7 @@ DAMAGE = {
     "code": lambda path: torch.save({"training": Evil()}, path),
     "other data": lambda path: torch.save({"training": 1}, path),
     "a list": lambda path: torch.save([1], path),
+    "steps in words": lambda path: torch.save({**checkpoint.read(path), "steps": "many"}, path),
     "a link": lambda path: (path.unlink(), path.symlink_to("/dev/zero")),
     "a link to a sound one": lambda path: path.symlink_to(path.rename(path.parent.parent / "elsewhere.pt")),
     "a link to the one before": lambda path: (path.unlink(), path.symlink_to(checkpoint.files_in(path.parent)[-1])),

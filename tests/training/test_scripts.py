@@ -18,6 +18,7 @@ PAIR = eb.load_scenario("cooperation-3-pair")
 
 @pytest.fixture
 def supersuit(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    pytest.importorskip("supersuit", reason="SuperSuit needs Python below 3.13")
     module = load("../../train/supersuit_ppo")
     monkeypatch.delitem(sys.modules, module.__name__)  # so that its functions are pickled as a script's are
     return module

@@ -295,6 +295,18 @@ def test_train__a_second_ctrl_c_stops_at_once(tmp_path: Path) -> None:
     assert kept(tmp_path / "run") == kept(tmp_path / "whole")
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_train__a_signal_stops_it_after_the_update_and_leaves_no_handler(number: int, tmp_path: Path) -> None:
+    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.MonkeyPatch.context() as patch:
+        disturb(patch, {40: lambda _: os.kill(os.getpid(), number)})
+        assert begin("ppo", tmp_path / "run").status == "interrupted"
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
+    go_on(tmp_path / "run")
+    begin("ppo", tmp_path / "whole")
+    assert kept(tmp_path / "run") == kept(tmp_path / "whole")
+
+
 SPOILED: dict[str, Callable[[Any], Any]] = {
     "rewards": lambda answer: answer[1].__setitem__(3, np.nan),
     "huge": lambda answer: answer[1].fill(1e38),

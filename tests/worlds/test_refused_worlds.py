@@ -43,6 +43,19 @@ REFUSED: dict[str, Callable[[], object]] = {
     "worlds.csv, line 1: unknown column 'gap_1_km'; did you mean gap_1_m (metres)?": lambda: read(
         "gap_1_km,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n1,2,3,4,5\n"
     ),
+    "worlds.csv, line 1: columns are separated by semicolons; separate them by commas": lambda: read(
+        HEADER.replace(",", ";") + "\n7,5;8;20;18;20\n"
+    ),
+    "worlds.csv, line 1: columns are separated by tabs; separate them by commas": lambda: read(
+        HEADER.replace(",", "\t") + "\n7\t8\t20\t18\t20\n"
+    ),
+    "worlds.csv, line 1: unknown column 'gap_3_m'; did you mean gap_": lambda: read(HEADER + ",gap_3_m\n1,2,3,4,5,6\n"),
+    "worlds.csv, line 1: unknown column 'obstacle_gap_m'; ": lambda: read(HEADER + ",obstacle_gap_m\n1,2,3,4,5,6\n"),
+    "worlds.csv, line 1: unknown column 'friction'; ": lambda: read(HEADER + ",friction\n1,2,3,4,5,0.5\n"),
+    "worlds.csv, line 1: column 'agent': a column of your own needs another name": lambda: read(
+        HEADER + ",agent\n1,2,3,4,5,x\n"
+    ),
+    "worlds.csv, line 1: column '': a column of your own needs another name": lambda: read(HEADER + ",\n1,2,3,4,5,x\n"),
     "worlds.csv, line 1: column 'gap_1_m' occurs twice": lambda: read(HEADER + ",gap_1_m\n1,2,3,4,5,6\n"),
     "worlds.csv, line 2: has 4 values, but the header has 5 columns": lambda: read(HEADER + "\n10,8,20,18\n"),
     "worlds.csv, line 3, column speed_1_mps: 'fast' is not a number": lambda: read(

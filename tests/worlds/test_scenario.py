@@ -388,6 +388,7 @@ BASED = {
     "a -> c -> a is a circle; base one of them on another scenario": "c.yaml",
     "a.yaml, line 3: mass_kg: unknown key; did you mean mass_t (tonnes)?": "paper-random\nmass_kg: 3",
     "missing.yaml: the file does not exist": "missing.yaml",
+    "more than 50 files are based on each other": "0.yaml",
 }
 
 
@@ -395,6 +396,8 @@ BASED = {
 def test_based_on__refuses(message: str, empty_folder: Path) -> None:
     write("b", "based_on: a.yaml\n")
     write("c", "mixture: [{scenario: paper-random}, {scenario: a.yaml}]\n")
+    for k in range(1000) if BASED[message] == "0.yaml" else ():
+        write(str(k), f"based_on: {k + 1}.yaml\n")
     with refused(message):
         load_scenario(write("a", f"based_on: {BASED[message]}\n"))
 

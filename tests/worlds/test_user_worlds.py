@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.episode.state import NUMBER
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.describe import quantities_of
@@ -62,6 +63,38 @@ def test_table__may_be_a_data_frame() -> None:
     other = {**COLUMNS, "gap_1_m": frame["gap_1_m"], "gap_2_m": frame["gap_2_m"].sort_index()}
     with refused("initial states: columns have different pandas indexes; give them the same"):
         worlds_from_table(PAPER, other)
+
+
+def test_column_of_the_users_own__is_a_label_of_the_results(empty_folder: Path) -> None:
+    lines = ["note," + HEADER + ",case", '"wet, dark",7,8,20,18,20,1', ",9,8,20,18,20,02", "dry,7,8,20,18,21,3"]
+    Path("mine.csv").write_text("\n".join(lines))
+    worlds = read_worlds(PAPER, "mine.csv")
+    bare = read_worlds(PAPER, "mine.csv")._replace(memories={})
+    assert bits(worlds._replace(memories={})) == bits(bare) and worlds.gaps_m[1].tolist() == [9.0, 8.0]
+    result = eb.evaluate(worlds.take([2, 0, 1]), "full_brake", scenario=PAPER)
+    assert result.worlds["note"].tolist() == ["dry", "wet, dark", ""]
+    assert result.worlds["case"].tolist() == result.arrays()["case"].tolist() == ["3", "1", "02"]
+    groups = eb.summarise_by(result, "note")
+    assert [*groups] == ["no note", "dry", "wet, dark"]
+    plain = eb.evaluate(bare, "full_brake", scenario=PAPER)["full_brake"]["total_harm"]
+    assert groups["dry"][0]["total_harm"].value == plain[2]
+    assert result["full_brake"]["total_harm"].tolist() == plain[[2, 0, 1]].tolist()
+    again = worlds_from_table(PAPER, {**{name: [7.0, 8.0] for name in COLUMNS}, "note": ["a", None], "case": [1, 2]})
+    assert eb.evaluate(again, "coast", scenario=PAPER).worlds["note"].tolist() == ["a", ""]
+
+
+def test_label__recording_gives_intervals_by_recording(empty_folder: Path) -> None:
+    rows = [f"{gap},8,20,18,20,drive {gap % 3}" for gap in range(5, 11)]
+    Path("mine.csv").write_text("\n".join([HEADER + ",recording", *rows]))
+    result = eb.evaluate(read_worlds(PAPER, "mine.csv"), "full_brake", scenario=PAPER)
+    assert result.clusters is not None and len({*result.clusters.tolist()}) == 3
+
+
+def test_label__that_a_measure_is_called_is_refused(empty_folder: Path) -> None:
+    for name in ("total_harm", "total_harm_1", "impacts"):
+        worlds = worlds_from_table(PAPER, {**COLUMNS, name: ["a", "b"]})
+        with refused("is the name of a column of the worlds; give another name"):
+            eb.evaluate(worlds, "full_brake", scenario=PAPER)
 
 
 NUMBERS = {

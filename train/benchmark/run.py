@@ -5,12 +5,13 @@
 
 A method is a name of `METHODS`, a recipe (its name or file), or `FILE.py:FUNCTION`. Such a function
 `train(task, seed, decisions, folder)` trains with that many decisions of all learners together, and saves what it has
-learned in `folder`; `make_agent(folder, settings)` of the same file makes the agent or team of it.
+learned in `folder`; `make_agent(folder, settings)` of the same file makes the agent or team of it. Before its first
+training in a task every method trains once with one decision, in another folder, so that compiling is no part of the
+measured processor time `cpu_s`.
 
 Each training has a folder in `OUTPUT/runs`, and each evaluated one a file in `OUTPUT/rows`. After an interruption,
 start the same command again: finished trainings are skipped, and an unfinished one of a recipe goes on from its last
-checkpoint. `OUTPUT/rows.csv` has all rows. `cpu_s` is the processor time of the training, without
-evaluations and compiling.
+checkpoint. `OUTPUT/rows.csv` has all rows, and for each task a row of full braking.
 
 On a Ray cluster, every computer needs the same packages, and must see `--output` under the same path. Everybody who
 can reach the ports of the cluster can run code on it with your rights, so open them to nobody else.
@@ -75,8 +76,13 @@ class Job(NamedTuple):
     settings: tuple[str, ...] = ()
 
     @property
+    def label(self) -> str:
+        """Name of the method in tables: a file without its folder."""
+        return Path(self.method).name
+
+    @property
     def name(self) -> str:
-        method = re.sub("[^a-z0-9_]+", "-", Path(self.method).name.lower().removesuffix(".yaml"))
+        method = re.sub("[^a-z0-9_]+", "-", self.label.lower().removesuffix(".yaml"))
         return f"{self.task.name}-{method}-seed{self.seed}"
 
     @property
@@ -98,7 +104,9 @@ class Job(NamedTuple):
                 self.warm_up()
             about = self.train()
             if not file.exists():
-                write_file(file, csv_text([self.evaluate(about)]).encode())
+                braking, own = self.evaluate(about)
+                write_file(braking_file(self.output, self.task.name), csv_text([braking]).encode())
+                write_file(file, csv_text([own]).encode())
             (row,) = csv.DictReader(file.read_text().splitlines())
             for name, value in {
                 "episodes": self.episodes,
@@ -109,7 +117,7 @@ class Job(NamedTuple):
                     raise InvalidInput(f"{file}: {name} = {row.get(name)}, not {value}; delete it to evaluate again")
         except Exception as error:  # the other trainings go on
             reason = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
-            return {"task": self.task.name, "method": self.method, "seed": self.seed, "reason": reason}
+            return {"task": self.task.name, "method": self.label, "seed": self.seed, "reason": reason}
         return row
 
     def warm_up(self) -> None:
@@ -144,11 +152,17 @@ class Job(NamedTuple):
             raise InvalidInput(f"{self.folder}: has a training with other settings or another file; {right}")
         return {"decisions": self.decisions, "cpu_s": done["cpu_s"]}
 
-    def evaluate(self, about: dict[str, Any]) -> dict[str, Any]:
-        agents = {"full_brake": "full_brake", self.method: self.agent}
+    def evaluate(self, about: dict[str, Any]) -> list[dict[str, Any]]:
+        """Rows of full braking and of the method."""
+        agents = {"full_brake": "full_brake", self.label: self.agent}
         result = evaluate_task(self.task, agents, episodes=self.episodes, seed=self.list_seed)
-        about = {"method": self.method, "seed": self.seed, **about, "list_seed": self.list_seed}
-        return benchmark_rows({self.task.name: eb.summarise(result)}, **about)[1]
+        about = {"method": self.label, "seed": self.seed, **about, "list_seed": self.list_seed}
+        braking, own = benchmark_rows({self.task.name: eb.summarise(result)}, **about)
+        return [braking | {"method": "full_brake", "seed": "", "decisions": "", "cpu_s": ""}, own]
+
+
+def braking_file(output: Path, task: str) -> Path:
+    return output / "rows" / f"{task}-full_brake.csv"
 
 
 # 2. What to train. All names and settings are checked before the first training begins.
@@ -191,6 +205,9 @@ def run(args: argparse.Namespace) -> int:
                 rows.append(row)
                 result = row.get("reason") or f"honest cost {float(row['honest_cost']):.2f}"
                 print(f"{len(rows)} of {len(jobs)}: {job.name}: {result}", flush=True)
+        for task in dict.fromkeys(job.task.name for job in jobs):
+            file = braking_file(args.output, task)
+            rows += csv.DictReader(file.read_text().splitlines()) if file.exists() else []
         write_file(args.output / "rows.csv", csv_text(rows).encode())
     return sum("reason" in row for row in rows)
 

@@ -1,11 +1,8 @@
 """What one vehicle can know of its line: its *median line*, made from its messages and the scenario's ranges.
 
-A value of another vehicle that has not been received is the median of its range in the scenario. The median line is
-simulated in parallel with the episode, from the alert on, with the vehicle's own actions; the others follow their
-scripts. Where the vehicle receives or measures something that the median line did not predict, received values replace
-assumed ones; everything else continues unchanged.
-
-Nothing else of the true state is read, so what was not received cannot change the median line.
+A value of another vehicle that has not been received is the median of its range. The median line is simulated in
+parallel with the episode, from the alert on, with the vehicle's own actions; the others follow their scripts. Where
+received or measured values differ, they replace assumed ones. Nothing else of the true state is read.
 """
 
 from __future__ import annotations
@@ -103,7 +100,7 @@ class News(NamedTuple):
         """Speeds (m/s) at ``time_s`` ([n, 1], s), and distances (m) driven since the newest samples; both [n, N + 1].
 
         Contacts are ignored. Bodies that are not located keep their ``speed``. Located ones accelerate at ``wanted``
-        (m/s2) from ``onset`` (s after the alert), up to the speed ``limit`` (m/s). These four are [n, N + 1].
+        (m/s2) from ``onset`` (s after the alert), up to ``limit`` (m/s).
         """
         speed, way = np.where(self.located, self.sample[:, SAMPLE_SPEED], speed), np.zeros(speed.shape)
         move_on(speed, way, wanted, onset - self.at_s, limit, np.where(self.located, time_s - self.at_s, 0.0))
@@ -111,10 +108,7 @@ class News(NamedTuple):
 
 
 class MedianLine(NamedTuple):
-    """The line that the vehicle ``body`` assumes before it has received anything.
-
-    Every quantity is the median of its range in the scenario.
-    """
+    """The line that the vehicle ``body`` assumes before it has received anything: medians of all ranges."""
 
     body: int
     alert: State  # [1] at the alert
@@ -123,10 +117,7 @@ class MedianLine(NamedTuple):
 
     @classmethod
     def of(cls, scenario: Scenario, body: int) -> MedianLine:
-        """Median line of the vehicle ``body`` in a scenario.
-
-        Raises ``InvalidInput`` for a mixture of scenarios, and if the commands of another vehicle cannot be predicted.
-        """
+        """Median line of the vehicle ``body`` in a scenario. Raises the errors of ``check_predictable``."""
         check_predictable(scenario, body)
         N = scenario.vehicles
         alert = draw_once(scenario, lambda width, stream: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
@@ -138,8 +129,7 @@ class MedianLine(NamedTuple):
     def commands(self, car: Floats, wanted: Floats) -> Floats:
         """Commands of all bodies, [n, N + 1] m/s2 (body 0: the obstacle).
 
-        Scripted vehicles do what their scripts command, other learners brake fully, and the vehicle ``self.body`` keeps
-        its command in ``wanted`` [n, N + 1]. ``car``: as in ``State``.
+        Scripts command as always, other learners brake fully, and ``self.body`` keeps its command in ``wanted``.
         """
         wanted = wanted.copy()
         for vehicle, role in enumerate(self.roles, 1):
@@ -148,11 +138,11 @@ class MedianLine(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Median lines at the alert, one for each world of ``alert``.
+        """Median lines at the alert with what the vehicle knows at the first decision ``state``, one for each world of
+        ``alert``.
 
-        They contain what the vehicle knows at the first decision, ``state``. Vehicles that are completely known by then
-        start as in the true worlds ``alert``, and so do the gaps between them. Raises ``InvalidInput`` for worlds that
-        depart from what the vehicle can estimate.
+        Vehicles that are completely known by then start as in ``alert``, and so do the gaps between them. Raises
+        ``InvalidInput`` for worlds that depart from what the vehicle can estimate.
         """
         require(alert, "an estimated line", SHOWN)
         news = self.received(state)
@@ -168,7 +158,7 @@ class MedianLine(NamedTuple):
         return alert._replace(line=line, car=car, wanted=self.commands(car, alert.wanted))
 
     def received(self, state: State) -> News:
-        """What the vehicle has received of each body until the time of ``state``, the true state."""
+        """What the vehicle has received until the time of the true ``state``."""
         if MESSAGES_KEY in state.memories:
             pieces, sample = known_pieces(state, self.body), newest_samples(state, self.body)
         else:
@@ -182,11 +172,7 @@ class MedianLine(NamedTuple):
         return News(pieces, sample, located, np.where(located, sample[:, AT], 0.0))
 
     def corrected(self, state: State, median: State) -> tuple[State, Bools]:
-        """Median lines after news, and whether they had predicted all news, [n].
-
-        ``state``: the true state. ``median``: the present median lines; those that the true state contradicts are
-        corrected.
-        """
+        """Median lines after news, and whether they had predicted all news, [n]. ``state``: the true state."""
         foretold = self.agrees(state, median)
         rows = (~foretold).nonzero()[0]
         if len(rows):
@@ -194,10 +180,7 @@ class MedianLine(NamedTuple):
         return median, foretold
 
     def agrees(self, state: State, median: State) -> Bools:
-        """Whether everything that the vehicle has received and measured is the same in the ``median`` line, [n].
-
-        ``state``: the true state now.
-        """
+        """Whether everything that the vehicle has received and measured is the same in the ``median`` line, [n]."""
         news = self.received(state)
         far = (
             np.abs(
@@ -212,7 +195,7 @@ class MedianLine(NamedTuple):
     def message_contents(self, state: State, sample: Floats) -> Floats:
         """All quantities of each body that its messages can contain, except the intent, [n, N + 1, PIECES - 1].
 
-        ``sample``: as in ``News``. Places are distances (m) from this vehicle.
+        Places are distances (m) from this vehicle.
         """
         car = state.car[:, [BRAKING, OWN_LATENCY, MASS]].copy()
         car[:, :, 0] = 0.0
@@ -224,9 +207,8 @@ class MedianLine(NamedTuple):
         """Median lines in which received values replace assumed ones; ``state`` is the true state now.
 
         A received place and speed are extrapolated to the present by the sender's script, without contact. A sender
-        that was not accelerating is assumed to react no earlier than at the time of its sample. A vehicle with an
-        unknown place keeps its distance to this vehicle, as far as the order of the line allows. This vehicle's own
-        motion and impacts are measured.
+        that was not accelerating is assumed to react no earlier than at its sample. A vehicle with an unknown place
+        keeps its distance to this vehicle, as far as the order of the line allows.
         """
         body, news = self.body, self.received(state)
         line, car = median.line.copy(), median.car.copy()
@@ -245,10 +227,7 @@ class MedianLine(NamedTuple):
         return median._replace(line=line, car=car, wanted=wanted)
 
     def onsets(self, news: News, car: Floats) -> Floats:
-        """Time from which each vehicle reacts, as this vehicle assumes, [n, N + 1] s after the alert.
-
-        Vehicles that are not located keep their latencies. ``car``: as in ``State``, with the received values.
-        """
+        """Time from which each vehicle reacts, as this vehicle assumes, [n, N + 1] s after the alert."""
         later = np.maximum(np.maximum(car[:, OWN_LATENCY], self.news_s), news.at_s)
         accelerates = news.with_force & (news.sample[:, SAMPLE_FORCE] != 0.0)
         return np.where(accelerates, news.at_s, np.where(news.located, later, car[:, LATENCY]))
@@ -256,9 +235,8 @@ class MedianLine(NamedTuple):
     def gaps(self, news: News, way: Floats, median: State, state: State) -> Floats:
         """Gaps ahead of all vehicles as this vehicle estimates them, [n, N + 1] m, as in the row GAP of ``State.line``.
 
-        Positions come from the newest samples in ``news`` plus ``way`` [n, N + 1] (m), the distance driven since then;
-        unknown ones come from ``median``. Between two vehicles with samples of the present, the gap is that of the true
-        state ``state``.
+        Positions are those of the newest samples plus ``way`` [n, N + 1] (m), the distance driven since then; unknown
+        ones come from ``median``. Between two vehicles with samples of the present, the gap is the true one.
         """
         body, gaps = self.body, median.line[:, GAP].copy()
         place = np.zeros(way.shape)  # distance from this vehicle (m)
@@ -278,9 +256,8 @@ class MedianLine(NamedTuple):
     def forces(self, news: News, wanted: Floats, onset: Floats, median: State, state: State) -> Floats:
         """Estimated acceleration of each body by its brakes or engine, [n, N + 1] m/s2.
 
-        Before the ``onset`` of a body (s after the alert) it is 0, afterwards the body's command ``wanted`` (m/s2). An
-        acceleration in a sample of the present replaces both. Bodies that are not located keep their acceleration in
-        ``median``. ``state``: the true state.
+        0 before the ``onset`` (s after the alert), afterwards the command ``wanted`` (m/s2). An acceleration in a
+        sample of the present replaces both. Bodies that are not located keep theirs in ``median``.
         """
         reacting = np.where((onset <= 0.0) | (onset < state.time_s[:, np.newaxis]), wanted, 0.0)
         force = np.where(news.located, reacting, median.line[:, FORCE])
@@ -290,10 +267,7 @@ class MedianLine(NamedTuple):
 
 
 def check_predictable(scenario: Scenario, body: int) -> None:
-    """Raise ``InvalidInput`` if the vehicle ``body`` cannot predict the line.
-
-    It cannot in a mixture of scenarios, if messages contain errors, or if the commands of another vehicle are unknown.
-    """
+    """Raise ``InvalidInput`` if the vehicle ``body`` cannot predict the line."""
     where = f"scenario {scenario.name!r}: estimated agents and shields need"
     if scenario.members:
         names = ", ".join(member.name for member in scenario.members)
@@ -309,8 +283,8 @@ def check_predictable(scenario: Scenario, body: int) -> None:
 def without_channel(game: Game, median: State) -> tuple[Game, State]:
     """Game and median lines in which every vehicle knows everything, for agents that drive in median lines.
 
-    A median line does not say when true values would be received. Each vehicle's own latency therefore includes its
-    wait for the alert.
+    A median line does not say when true values would be received, so each vehicle's own latency includes its wait for
+    the alert.
     """
     car = median.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]

@@ -1,6 +1,6 @@
-"""Shields and E-V2X-BM that use only what their vehicle has received: they decide in its median line (``estimated``).
+"""Shield that uses only what its vehicle has received: it decides in the vehicle's median line (``estimated``).
 
-They guarantee nothing: the true line may do more harm than the bound in the median line. The info ``trusted`` is false
+It guarantees nothing: the true line may do more harm than the bound in the median line. The info ``trusted`` is false
 once something was received or measured that the median line had not predicted.
 """
 
@@ -34,12 +34,6 @@ class EstimatedShield(StepShield):
     """The step shield of one learner, in the line that its vehicle estimates (``estimated.MedianLine``). No guarantee.
 
     Its bound is the harm of the plan in the median line, and may rise when that line is corrected.
-
-    Args:
-        drivers: body -> agent, as for ``StepShield``.
-        scenario: the scenario of the worlds.
-        harm_count: which count of harm is bounded (``episode.counts``).
-
     """
 
     knows = ESTIMATED
@@ -71,9 +65,7 @@ class EstimatedShield(StepShield):
         return applied, memory._replace(members=memory.members._replace(median=after))
 
     def possible_states(self, state: State, memory: StepShieldMemory) -> State:
-        """The lines that the vehicle assumes (``MedianLine``), in place of the true states. The memories of its agents
-        are those in ``state``.
-        """
+        """The median lines, in place of the true states, with the agents' memories in ``state``."""
         median: State = memory.members.median
         agent_memories = {body: state.memories[body] for body in self.drivers if body in state.memories}
         return median._replace(memories={**median.memories, **agent_memories})
@@ -82,9 +74,8 @@ class EstimatedShield(StepShield):
         return super().rolled_out(*without_channel(game, state), plans, most)
 
     def plan_again(self, game: Game, memory: StepShieldMemory, median: State, rows: Ints) -> StepShieldMemory:
-        """Memory in which the worlds ``rows`` have the cheapest of their present plan and new plans.
-
-        ``median``: the corrected median lines of these worlds.
+        """Memory in which the worlds ``rows``, with corrected ``median`` lines, have the cheapest of their plan and new
+        plans.
         """
         plan, price = memory.plan.copy(), memory.price.copy()
         plan[rows], price[rows] = self.cheapest(game, median, [plan[rows], *self.plans(game, median, median, median)])

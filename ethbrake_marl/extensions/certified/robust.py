@@ -1,7 +1,7 @@
 """The robust shield: its bound holds in the nominal world and in every corner of its box of possible worlds.
 
-It is the step shield with one change: the price of a plan is its largest harm over all *members* of a world, which are
-the nominal world and the corners (``uncertainty``). The members are simulated in parallel with the episode, with the
+It is the step shield with one change: the price of a plan is its largest harm over all *members* of a world, the
+nominal world and the corners (``uncertainty``). The members are simulated in parallel with the episode, with the
 applied actions, by the episode's own step; so the proof of the step shield holds in each of them. It does not hold
 between the corners (docs/shield.md).
 """
@@ -36,17 +36,10 @@ class Members(NamedTuple):
 
 
 class RobustShield(StepShield):
-    """Shield whose bound holds in the nominal world and in every corner of the intervals around its quantities.
+    """Shield whose bound holds in the nominal world and in every corner of the intervals, but not between the corners.
 
-    The bound does not hold between the corners. The info ``trusted`` is false once a gap or speed was observed, before
-    any impact, that the intervals rule out.
-
-    Args:
-        drivers: body -> agent, as for ``StepShield``.
-        uncertainty: intervals around the nominal quantities, required, such as ``gaps_m=0.5,mass_t=10%``.
-        harm_count: which count of harm is bounded (``episode.counts``).
-        allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
-
+    The info ``trusted`` is false once a gap or speed was observed, before any impact, that the intervals rule out.
+    ``uncertainty``: such as ``gaps_m=0.5,mass_t=10%``. Other arguments: ``StepShield``.
     """
 
     knows = MODEL
@@ -63,10 +56,7 @@ class RobustShield(StepShield):
         self.uncertainty = parse_uncertainty(uncertainty)
 
     def begin(self, game: Game, alert: State, state: State) -> StepShieldMemory:
-        """Memory of the shield at the first decision, with the possible worlds around each world of ``alert``.
-
-        Raises ``InvalidInput`` if the intervals do not fit the worlds.
-        """
+        """Memory at the first decision. Raises ``InvalidInput`` if the intervals do not fit the worlds."""
         states = reset_without_shield(game, self.uncertainty.members(alert))
         if (states.time_s >= game.settings.horizon_s).any():
             raise InvalidInput(
@@ -77,30 +67,20 @@ class RobustShield(StepShield):
         return memory._replace(members=Members(split_members(states, state.n), np.ones(state.n, np.bool_)))
 
     def possible_states(self, state: State, memory: StepShieldMemory) -> State:
-        """The possible states of each world: its nominal state, then the corners of its uncertainty; [n M, ...] in all.
-
-        Agents have the memories that they have in ``state``.
-        """
+        """The possible states of each world: its nominal state, then the corners; [n M, ...] in all."""
         states = join_members(memory.members.states)
         rows = np.arange(state.n).repeat(states.n // state.n)
         agent_memories = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}
         return states._replace(memories={**states.memories, **agent_memories})
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
-        """Harm of each plan in the worst of the M possible states of its world, [n] m2/s2.
-
-        ``states``: M rows for each world. ``plans``: one for each world. A simulation stops once its harm is above
-        ``most``. ``caps`` is unused.
-        """
+        """Harm of each plan in the worst of the M possible states of its world, [n] m2/s2. ``caps`` is unused."""
         M = states.n // len(plans)
         limits = np.broadcast_to(most, len(plans)).repeat(M)
         return np.asarray(super().price(game, states, plans.repeat(M, axis=0), limits).reshape(-1, M).max(axis=1))
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        """Candidate plans at the alert: those of the step shield, and the constant plan that is best in the worst case.
-
-        ``states``: the possible states, M rows for each world of ``state``.
-        """
+        """Candidate plans of the step shield, and the constant plan that is best in the worst case."""
         learners, n, plans = game.settings.learners, state.n, super().plans(game, alert, state, states)
         if states.n == n:
             return plans
@@ -113,10 +93,7 @@ class RobustShield(StepShield):
     def decide(
         self, game: Game, state: State, proposed: Floats | None, *, donate: bool
     ) -> tuple[Floats, StepShieldMemory]:
-        """Applied actions and the new memory, as for ``StepShield``.
-
-        Also advances the possible states, and checks whether the observed state lies in their range (``trusted``).
-        """
+        """As for ``StepShield``. Also advances the possible states, and compares the state with their range."""
         before: Members = state.memories["shield"].members
         trusted, states = before.trusted & may_be_in(state, before.states), join_members(before.states)
         applied, memory = super().decide(game, state, proposed, donate=donate)
@@ -128,25 +105,26 @@ class RobustShield(StepShield):
 
 
 def reset_without_shield(game: Game, alerts: State) -> State:
-    """First decisions of the worlds ``alerts``, in the game without its shield and without reward shaping."""
+    """First decisions of the worlds ``alerts``, without shield and reward shaping."""
     return game._replace(shield=None, rewarding=game.rewarding._replace(shaping=None)).reset(alerts)
 
 
 def split_members(states: State, n: int) -> State:
-    """Reshape the arrays of states from M rows for each of n worlds, [n M, ...], to [n, M, ...]."""
+    """[n M, ...] -> [n, M, ...]."""
     return map_arrays(lambda array: array.reshape(n, len(array) // n, *array.shape[1:]), states)  # type: ignore[no-any-return]
 
 
 def join_members(states: State) -> State:
-    """Reshape the arrays of states from [n, M, ...] to M rows for each of n worlds, [n M, ...]."""
+    """[n, M, ...] -> [n M, ...]."""
     return map_arrays(lambda array: array.reshape(array.shape[0] * array.shape[1], *array.shape[2:]), states)  # type: ignore[no-any-return]
 
 
 def may_be_in(state: State, members: State) -> Bools:
-    """Whether all gaps and speeds of ``state`` lie within the range of the possible states ``members``, [n].
+    """Whether all gaps and speeds of ``state`` lie within the range of its ``members`` [n, M, ...], or after an impact,
+    [n].
 
-    Arrays of ``members`` are [n, M, ...]. The result is true after any impact. Before the first impact, gaps and speeds
-    are monotone in each quantity, so every world within the intervals lies in this range.
+    Before the first impact, gaps and speeds are monotone in each quantity, so every world within the intervals lies in
+    this range.
     """
     struck = state.line[:, IMPACTS].any(axis=1) | members.line[:, :, IMPACTS].any(axis=(1, 2))
     inside = np.ones(state.n, np.bool_)

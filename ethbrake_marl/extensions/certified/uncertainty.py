@@ -1,9 +1,9 @@
 """Uncertainty: intervals around the quantities of a world, and the *members* that stand for all worlds in them.
 
-The true value of a quantity with the nominal value x lies in [x - h, x + h]. The half-width h is a number in the
-quantity's unit, or a share of x (such as 5 %). Intervals end at what is possible: latencies, speeds and gaps of 0, and
-the vehicle's speed limit. The *box* of a world is the set of all combinations of values. Its *members* are the nominal
-world and every corner of the box: 2^d corners for d uncertain numbers.
+The true value of a quantity with the nominal value x lies in [x - h, x + h], where h is a number in the quantity's
+unit, or a share of x. Intervals end at what is possible: latencies, speeds and gaps of 0, and the speed limit. The
+*box* of a world is the set of all combinations of values. Its *members* are the nominal world and every corner of the
+box: 2^d corners for d uncertain numbers.
 """
 
 from __future__ import annotations
@@ -59,9 +59,8 @@ class Uncertainty(NamedTuple):
     def members(self, alert: State) -> State:
         """Possible worlds, M rows for each world of ``alert``: the world itself, then the corners of its box.
 
-        The *box* contains all combinations of values in the intervals. Corner k takes the upper end of uncertain number
-        i where bit i of k is 1, otherwise the lower end. Raises ``InvalidInput`` if an interval does not fit the
-        worlds, and for more than ``MOST_CORNERS`` corners.
+        Corner k takes the upper end of uncertain number i where bit i of k is 1. Raises ``InvalidInput`` if an interval
+        does not fit the worlds, and for more than ``MOST_CORNERS`` corners.
         """
         sides = self.sides(alert)
         if 2 ** len(sides) > MOST_CORNERS:
@@ -76,10 +75,7 @@ class Uncertainty(NamedTuple):
         return members.take(np.arange(members.n).reshape(-1, alert.n).T.ravel())
 
     def draw(self, alert: State, rng: np.random.Generator, *, corners: bool = False) -> State:
-        """One random world for each world of ``alert``: uniform in its box, or one of the box's ``corners``.
-
-        The *box* contains all worlds whose quantities are in the intervals.
-        """
+        """One random world for each world of ``alert``: uniform in its box, or one of the box's ``corners``."""
         sides = self.sides(alert)
         shares = rng.random((alert.n, len(sides)))
         return worlds_at(alert, sides, np.round(shares) if corners else shares)
@@ -87,7 +83,7 @@ class Uncertainty(NamedTuple):
     def sides(self, alert: State) -> list[Side]:
         """Uncertain numbers of the worlds: one for each interval and each vehicle or pair to which it applies.
 
-        An interval of width 0 gives none. Raises ``InvalidInput`` if an interval does not fit the worlds.
+        Raises ``InvalidInput`` if an interval does not fit the worlds.
         """
         sides = []
         for interval in self.intervals:
@@ -117,19 +113,15 @@ class Uncertainty(NamedTuple):
 
 
 def values_of(alert: State, key: str) -> Floats:
-    """Nominal values of a quantity such as ``gaps_m``, [n, N + 1]: one column for each body (0: the obstacle).
-
-    Column 0 and, of gaps, the last column have no meaning.
-    """
+    """Nominal values of a quantity such as ``gaps_m``, [n, N + 1]. Column 0 and, of gaps, the last have no meaning."""
     return alert.line[:, OF_LINE[key]] if key in OF_LINE else alert.car[:, OF_CAR[key]]
 
 
 def worlds_at(alert: State, sides: list[Side], shares: Floats) -> State:
-    """Worlds in which each uncertain number lies at a share of its interval: 0 is the lower end, 1 the upper end.
+    """Worlds in which each of d ``sides`` lies at a share [n, d] of its interval: 0 is the lower end, 1 the upper end.
 
-    ``sides``: the d uncertain numbers. ``shares`` [n, d]: the shares. A vehicle that brakes fully does so with its new
-    capacity. Without a V2X channel, a vehicle that reacts later also learns everything later. Raises ``InvalidInput``
-    if a script's command exceeds the vehicle's new capacity.
+    A vehicle that brakes fully does so with its new capacity. Without a V2X channel, a vehicle that reacts later also
+    learns everything later. Raises ``InvalidInput`` if a script's command exceeds the new capacity.
     """
     line, car, know, wanted = alert.line.copy(), alert.car.copy(), alert.know.copy(), alert.wanted.copy()
     for (key, body, low, high), at in zip(sides, shares.T, strict=True):
@@ -152,8 +144,7 @@ def worlds_at(alert: State, sides: list[Side], shares: Floats) -> State:
 def parse_uncertainty(text: object) -> Uncertainty:
     """Read intervals ``quantity=half-width``, separated by commas or colons, as in ``EXAMPLE``.
 
-    A half-width is a number in the quantity's unit, or a percentage of the nominal value. The ending ``.vehicle_2`` or
-    ``.pair_1`` of the quantity limits the interval to one vehicle or pair. Raises ``InvalidInput`` for any other text.
+    The ending ``.vehicle_2`` or ``.pair_1`` of the quantity limits the interval to one vehicle or pair.
     """
     form = f"must be quantity=half-width, for instance {EXAMPLE}"
     if not isinstance(text, str):

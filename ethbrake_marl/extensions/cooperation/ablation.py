@@ -84,9 +84,8 @@ class Ablation:
         return tuple(f"{recipe.name}-{recipe.scheme}" for recipe in self.recipes)
 
     def jobs(self) -> Iterator[tuple[Level, str, Job]]:
-        """Every training of the ablation: level, algorithm (recipe and scheme), and job.
-
-        A level with one learner is trained without a scheme; only the name of its folder shows this.
+        """Every training: level, algorithm (recipe and scheme), and job. A level with one learner is trained without a
+        scheme.
         """
         for seed in range(self.seeds):
             for recipe, algorithm in zip(self.recipes, self.algorithms, strict=True):
@@ -128,10 +127,7 @@ class LevelResult(NamedTuple):
 
 
 def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
-    """Start or continue all trainings, ``jobs`` at a time. Return False if Ctrl-C stopped a training.
-
-    Raises ``InvalidInput`` if the folder of a training contains anything else.
-    """
+    """Start or continue all trainings, ``jobs`` at a time. Return False if Ctrl-C stopped a training."""
     all_jobs = [job for _, _, job in plan.jobs()]
     for job_number, finished in enumerate(run_each(((job.finish,) for job in all_jobs), jobs), 1):
         if not finished:
@@ -141,7 +137,6 @@ def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
 
 
 def measure(plan: Ablation, tell: OnProgress) -> list[LevelResult]:
-    """Drive all worlds at every level with every trained team; one result for each level and algorithm."""
     trained: dict[Any, list[Job]] = {}
     for level, name, job in plan.jobs():
         trained.setdefault((level.name, name), []).append(job)
@@ -159,10 +154,10 @@ def measure(plan: Ablation, tell: OnProgress) -> list[LevelResult]:
 
 
 def measure_level(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None, jobs: Any) -> LevelResult:
-    """Results of one level if the teams that ``jobs`` have trained drive its worlds.
+    """Results of one level if the teams that ``jobs`` have trained drive its worlds, or, without jobs, its scripts
+    alone.
 
-    Full braking of all learners is measured for comparison. Without jobs, only the scripts drive. ``algorithm``: the
-    algorithm's name in the results.
+    Full braking of all learners is measured for comparison. ``algorithm``: its name in the results.
     """
     scenario, measures = level.scenario, []
     named = {f"{algorithm} seed {seed}": f"team@{job.folder}" for seed, job in enumerate(jobs)}
@@ -192,9 +187,8 @@ def measure_level(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None
 
 
 def minimised_amount(declared: Declared, count: str, game: Game, alert: State, last: State) -> MeasureValue:
-    """What the training minimises: the objective ``declared`` in ``count``, as a mean over the learners, [n].
-
-    It is a measure once its first two arguments are bound; ``alert`` is unused.
+    """What the training minimises: the objective ``declared`` in ``count``, mean over the learners, [n]; a measure if
+    bound.
     """
     vehicle_amounts = amounts(objectives_of(declared, last.vehicles), None, last, count)
     return np.asarray(vehicle_amounts[:, game.settings.learners - 1].mean(axis=1))
@@ -211,10 +205,9 @@ class Answer(NamedTuple):
 
 
 def with_optima(plan: Ablation, measured: Sequence[LevelResult], threads: int, tell: OnProgress) -> list[LevelResult]:
-    """Results with the joint optimum added at each level that has a learner: the least known harm, also among the
-    trained teams and the commands found at other levels (``least_known``).
+    """Results with the joint optimum of each level that has a learner (``least_known``).
 
-    Levels with the same worlds, learners and scripts share one search. Finished parts of a search are read from files.
+    Levels with the same worlds, learners and scripts share one search, whose finished parts are read from files.
     """
     tables: dict[bytes, BestHarmTable] = {}
     answers: dict[str, Answer] = {}
@@ -247,10 +240,7 @@ def _tell_progress(tell: OnProgress, name: str, finished: int, total: int) -> No
 
 
 def least_known(answer: Answer, answers: Iterable[Answer], count: str) -> Floats:
-    """Least known harm in each world of ``answer``, [m] m2/s2, among the commands of all ``answers``.
-
-    Commands of another level count only in worlds in which the learners of ``answer`` can give them (``can_imitate``).
-    """
+    """Least known harm in each world, [m] m2/s2, among the commands of all ``answers`` that ``can_imitate`` allows."""
     best = np.full(answer.worlds.n, np.inf)
     for original in answers:
         can = can_imitate(answer, original)
@@ -273,8 +263,8 @@ def can_imitate(imitator: Answer, original: Answer) -> Bools:
 
     They can if each learner of ``original`` learns in ``imitator``, the scripted vehicles of ``imitator`` have the same
     roles in both, lines and latencies (with the wait for the alert) are the same, and each decision time of
-    ``original`` is also a decision time of ``imitator``. Only ``imitator`` may have an obstacle, because the commands
-    are simulated again in its worlds.
+    ``original`` is one of ``imitator``. Only ``imitator`` may have an obstacle: the commands are simulated again in its
+    worlds.
     """
     imitator_scenario, original_scenario = imitator.scenario, original.scenario
     scripted = [name for name, role in imitator_scenario.roles.items() if role != "learner"]

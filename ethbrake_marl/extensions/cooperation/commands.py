@@ -11,12 +11,26 @@ from rich.text import Text
 
 from ethbrake_marl.cli.command import ForceOption, JobsOption, JsonOption, Out, SettingsOption, example
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.registry import Part
 
 DEFAULT_AGENTS = "e_v2x_bm,universal"  # agents that are compared with the front if the scenario has one learner
 AFTER_STOPPED_STUDY = "the same command continues the work in this folder"
 
 
+study_group = typer.Typer(
+    rich_markup_mode=None,
+    add_completion=False,
+    help="Compare levels of cooperation, and choices of whose harm counts.",
+    epilog=example("study ablate --quick --output runs/ablation-quick", "study front --output runs/front"),
+)
+
+
+@study_group.command(
+    "ablate",
+    epilog=example(
+        "study ablate --quick --output runs/ablation-quick",
+        "study ablate --sweep objective=social:0..90:15 --output runs/angle",
+    ),
+)
 def ablate_command(
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")],
     levels: Annotated[
@@ -79,7 +93,7 @@ def ablate_command(
             with_optima,
         )
         from ethbrake_marl.extensions.cooperation.levels import STANDARD, SWEEP_LEVEL, read_levels, sweep_levels
-        from ethbrake_marl.extensions.cooperation.results import tables, write_ablation
+        from ethbrake_marl.extensions.cooperation.results import ablation_results, tables, write_ablation
         from ethbrake_marl.training.recipe import load_recipe
 
         if sweep is not None and len(sweep) > 1:
@@ -107,21 +121,20 @@ def ablate_command(
             if not train_all(plan, jobs or 1, out.show_progress):
                 out.interrupted(f"interrupted; {AFTER_STOPPED_STUDY}")
             measured = with_optima(plan, measure(plan, out.show_progress), jobs or 1, out.show_progress)
-            results, paths = write_ablation(plan, measured)
+            results = ablation_results(plan, measured)
+            with out.writing():
+                out.note(f"results: {', '.join(map(str, write_ablation(plan, measured, results)))}")
         alarms = [Text(line, "bold red") for line in results["undertrained"]]
         out.result(results, *tables(results), results["conditions"], *alarms, in_file=True)
-        out.note(f"results: {', '.join(map(str, paths))}")
 
 
-ABLATE = Part(
-    ablate_command,
+@study_group.command(
+    "front",
     epilog=example(
-        "study ablate --quick --output runs/ablation-quick",
-        "study ablate --sweep objective=social:0..90:15 --output runs/angle",
+        "study front --output runs/front",
+        "study front --weights 1,1,1 --weights 4,1,1 --agents vine-preference --output runs/two",
     ),
 )
-
-
 def front_command(
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")],
     scenario: Annotated[
@@ -223,18 +236,10 @@ def front_command(
         beside = {"full_brake": full_braking(chosen, drawn_worlds), "maximin": largest}
         results = front_results(front, chosen, drawn_worlds, beside, seed)
         results |= {"budget": budget, "settings": list(settings or ())}
-        output.mkdir(parents=True, exist_ok=True)
-        out.write(output / "front.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
-        out.write(output / "front.png", picture_bytes(front_figure(results), "front.png"), "figure")
+        with out.writing():
+            output.mkdir(parents=True, exist_ok=True)
+            out.write(output / "front.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
+            out.write(output / "front.png", picture_bytes(front_figure(results), "front.png"), "figure")
         out.result(results, front_sheet(results), hypervolume_sheet(results), in_file=True)
         if n < episodes:
             out.interrupted(f"interrupted; the results are those of the first {n:,} worlds")
-
-
-FRONT_PART = Part(
-    front_command,
-    epilog=example(
-        "study front --output runs/front",
-        "study front --weights 1,1,1 --weights 4,1,1 --agents vine-preference --output runs/two",
-    ),
-)

@@ -48,7 +48,6 @@ class Front(NamedTuple):
 
     @property
     def amounts(self) -> Floats:
-        """Weighted harm of each world under the best commands for each choice of weights, [W, n] m2/s2."""
         return np.stack(
             [weighted_harm(harm, row) for harm, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
         )
@@ -66,10 +65,10 @@ def weighted_harm(borne: Floats, weights: Floats) -> Floats:
 
 
 def weight_grid(vehicles: int, steps: int) -> Floats:
-    """W evenly spaced choices of weights, [W, N]. The weights of each choice sum to 1.
+    """W evenly spaced choices of weights, [W, N], with sum 1; from row to row 1 / ``steps`` moves from one vehicle to
+    another.
 
-    From each row to the next, one weight rises by 1 / ``steps``, and another falls by as much. Raises ``InvalidInput``
-    for more than ``MOST_CHOICES`` choices.
+    Raises ``InvalidInput`` for more than ``MOST_CHOICES`` choices.
 
     >>> from ethbrake_marl.extensions.cooperation import weight_grid
     >>> weight_grid(3, 1).tolist()
@@ -96,18 +95,12 @@ def _divisions(vehicles: int, steps: int) -> list[list[int]]:
 
 
 def corners(vehicles: int) -> Floats:
-    """One choice of weights for each vehicle, [N, N]: weight 1 for this vehicle, ``SLIGHT`` for all others.
-
-    The harm of the others therefore decides only between commands under which this vehicle has almost the same harm.
-    """
+    """One choice of weights for each vehicle, [N, N]: 1 for it, ``SLIGHT`` for others, which decides between equals."""
     return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
 
 
 def weight_table(rows: Sequence[Sequence[Any]]) -> Floats:
-    """Choices of weights as an array, [W, N].
-
-    Raises ``InvalidInput`` for rows of different lengths, and for a weight that is not a number.
-    """
+    """Choices of weights, [W, N]. Raises ``InvalidInput`` for unequal rows, and for what is not a number."""
     numbers = all(isinstance(weight, int | float) and not isinstance(weight, bool) for row in rows for weight in row)
     if not numbers or len({len(row) for row in rows}) != 1:
         text = "; ".join(",".join(map(str, row)) for row in rows)
@@ -129,10 +122,9 @@ def search_front(
 ) -> Front:
     """Search every world for the commands with the least weighted harm, for every choice of weights.
 
-    The weighted harm is at most that of ``FRONT_CONSTANTS`` constant commands, of the shipped profiles of this world,
-    of ``agents``, of every shipped policy, and of the results for all other choices. With several learners that all
-    decide at the same times, it is also at most what the same search reaches with each of them alone, while the others
-    brake fully. A world's result depends on no other world.
+    The result is at most the weighted harm of ``FRONT_CONSTANTS`` constant commands, the shipped profiles of this
+    world, ``agents``, every shipped policy, and the results for all other choices; and, with several learners that
+    decide at the same times, what the same search reaches with each of them alone. No world depends on another.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import search_front
@@ -195,19 +187,16 @@ def _join_chunks(parts: Sequence[BorneHarm]) -> BorneHarm:
 
 
 class Drivers(NamedTuple):
-    """The learners of a game, and the agents that may drive them under each choice of weights."""
-
     game: Game
     preferring: Sequence[tuple[Game, Mapping[str, Team]]]  # for each choice: the game with these weights, and agents
     alone: Mapping[int, Drivers]  # body -> the same for each of several learners, while the others brake fully
 
     @staticmethod
     def of(scenario: Scenario, weights: Floats, names: Sequence[str], count: str) -> Drivers:
-        """The learners of ``scenario``, and for each choice of weights (row of ``weights`` [W, N]) the agents
-        ``names``, made to minimise the weighted harm.
+        """The learners, and for each choice of weights (row of ``weights`` [W, N]) the agents that minimise the
+        weighted harm.
 
-        With several learners, ``alone`` holds the same for each learner by itself while the others brake fully, with
-        only the agents that can drive it. ``count``: the count of harm that agents minimise.
+        ``alone``: the same for each of several learners by itself, with only the agents that can drive it.
         """
         chosen = [scenario.replace(harm_weight=row.tolist(), objective="preference") for row in weights]
         teams = [make_teams(names, variant, harm_count=count) for variant in chosen]
@@ -226,8 +215,7 @@ def _search_chunk(
     """Pool of the best profiles (commands over time) of all searches, and the harm of each vehicle if agents drive.
 
     Each of several learners is first searched alone. Then every choice of weights is searched twice; the second search
-    starts from the best profiles of all choices. ``effort``: budget and threads. ``tell`` is called with numbers of
-    finished searches.
+    starts from the best profiles of all choices.
     """
     pool = ProfilePool(problem_of(drivers.game, worlds, count=count), count)
     driven, problem = _try_known_commands(pool, worlds, weights, drivers.preferring), pool.problem
@@ -250,10 +238,9 @@ def _search_chunk(
 def _try_known_commands(
     pool: ProfilePool, worlds: State, weights: Floats, preferring: Sequence[tuple[Game, Mapping[str, Team]]]
 ) -> dict[str, BorneHarm]:
-    """Add known profiles to ``pool``: constant commands, the shipped profiles, and the commands of agents.
+    """Add constant commands, the shipped profiles, and the commands of agents to ``pool``.
 
-    Returns the harm of each vehicle if the agents drive, agent -> count -> [W, n, N] m2/s2. ``preferring``: for each
-    choice of weights, the game and its agents.
+    Returns agent -> count -> [W, n, N] m2/s2. ``preferring``: for each choice of weights, the game and its agents.
     """
     problem = pool.problem
     constants = problem.constant(problem.even_grid(FRONT_CONSTANTS))
@@ -277,10 +264,7 @@ def _try_known_commands(
 
 
 def observes_weights(team: Team) -> bool:
-    """Whether the commands of a team may depend on the weights of harm.
-
-    False only if every driver is a policy that does not observe the weights, and there is no shield.
-    """
+    """Whether a team's commands may depend on the weights: not if all drivers are policies that do not observe them."""
     policies = [getattr(agent, "policy", None) for agent in team.drivers.values()]
     feature_names = [() if policy is None else policy.observation.names for policy in policies]
     return team.shield is not None or any(
@@ -297,7 +281,6 @@ class ProfilePool:
         self.borne: dict[str, list[Floats]] = {harm_count: [] for harm_count in COUNTS}
 
     def add(self, profiles: Profiles) -> BorneHarm:
-        """Simulate profiles and store them; return the harm of each vehicle, count -> [n, N] m2/s2."""
         self.profiles.append(profiles)
         last = self.problem.follow(profiles)
         for count, harms in self.borne.items():
@@ -305,9 +288,8 @@ class ProfilePool:
         return {count: harms[-1] for count, harms in self.borne.items()}
 
     def choice(self, weights: Floats) -> Ints:
-        """Number of the profile with the least weighted harm in each world, [n].
-
-        Among equal profiles, it has the least total harm of all vehicles. ``weights`` [N].
+        """Number of the profile with the least weighted harm in each world, [n]; among equals, with the least total
+        harm.
         """
         borne = np.stack(self.borne[self.count])
         amounts = weighted_harm(borne, weights)
@@ -331,10 +313,9 @@ class ProfilePool:
 def least_largest(
     scenario: Scenario, worlds: State, front: Front, *, budget: int = FRONT_BUDGET, threads: int = 1
 ) -> BorneHarm:
-    """Search for the commands that minimise the largest harm of a vehicle (maximin).
+    """Search for the commands that minimise the largest harm of a vehicle (maximin): count -> [n, N] m2/s2.
 
-    Returns the harm of each vehicle under them, count -> [n, N] m2/s2. The largest harm is at most that under any
-    profile of ``front``, which must come from the same worlds.
+    The largest harm is at most that under any profile of ``front``, which must come from the same worlds.
     """
     game, parts = open_game(scenario)[1], []
     for first in range(0, worlds.n, FRONT_CHUNK):

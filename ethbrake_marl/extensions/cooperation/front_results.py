@@ -44,12 +44,11 @@ SIZE_IN = (5.6, 4.6)  # narrow enough for a phone
 def front_results(
     front: Front, scenario: Scenario, drawn_worlds: DrawnWorlds, beside: Mapping[str, BorneHarm], seed: int | None
 ) -> Json:
-    """Content of ``front.json``: the front, full braking, maximin, and the agents.
+    """Content of ``front.json``: the front, ``beside`` (name -> count -> [n, N] m2/s2, with ``full_brake``), and the
+    agents.
 
-    Means have 95 % intervals over worlds, or over recordings. For each choice of weights, ``ratio`` is an agent's mean
-    weighted harm divided by the front's (null if the front's is 0), and ``above`` the agent's minus the front's.
-    ``beside``: results to compare with the front, name -> count -> harm of each vehicle, [n, N] m2/s2; it must contain
-    ``full_brake``.
+    For each choice of weights, ``ratio`` is an agent's mean weighted harm divided by the front's (null if that is 0),
+    and ``above`` the difference.
     """
     by = clusters_of(columns_of(drawn_worlds))
     return {
@@ -91,13 +90,11 @@ def _vehicles(borne: BorneHarm, by: Clusters) -> dict[str, list[Json]]:
 
 
 def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
-    """Hypervolumes of the front and of each agent, for two reference points.
+    """Hypervolumes of the front and of each agent, for two reference points; none above ``MOST_DIMENSIONS`` vehicles.
 
-    A point is the mean harm of all vehicles for one choice of weights. The first reference point is full braking
-    (``full_brake`` [n, N] m2/s2), so only points count that are better for every vehicle. The second has, for each
-    vehicle, its mean harm under full braking or its largest mean harm on the front, whichever is larger. ``share``: an
-    agent's hypervolume divided by the front's, None if the front's is 0. The result is empty for more than
-    ``MOST_DIMENSIONS`` vehicles.
+    A point is the mean harm of all vehicles for one choice of weights. The first reference is full braking
+    (``full_brake`` [n, N] m2/s2). The second has, for each vehicle, the larger of its mean harm under full braking and
+    its largest on the front. ``share``: an agent's hypervolume divided by the front's, None if that is 0.
     """
     if len(full_brake.T) > MOST_DIMENSIONS:
         return []
@@ -121,10 +118,10 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
 
 
 def hypervolume(points: Floats, reference: Floats) -> float:
-    """Exact volume of the region that ``points`` [Q, N] dominate, up to the point ``reference`` [N].
+    """Exact volume of the region that ``points`` [Q, N] dominate (smaller is better), up to the point ``reference``
+    [N].
 
-    Smaller coordinates are better. A point is ignored unless all its coordinates are below those of the reference
-    point. The region is cut into slices along the last coordinate (Zitzler 1999, "hypervolume by slicing objectives").
+    The region is cut into slices along the last coordinate (Zitzler 1999, "hypervolume by slicing objectives").
 
     >>> import numpy as np
     >>> from ethbrake_marl.extensions.cooperation.front_results import hypervolume
@@ -149,11 +146,7 @@ def full_braking(scenario: Scenario, drawn_worlds: DrawnWorlds) -> BorneHarm:
 
 
 def front_sheet(results: Json) -> Sheet:
-    """Table with one row for each choice of weights, then one for each result that is compared with the front.
-
-    Its columns are each vehicle's mean of the harm that is weighted, the line's mean of every count of harm, and each
-    agent's ``ratio``.
-    """
+    """Table with one row for each choice of weights, then one for each result that is compared with the front."""
     count, agents = results["harm_count"], results["agents"]
 
     def row(name: str, vehicles: Mapping[str, list[Json]], *ratios: float | None) -> tuple[str | float | None, ...]:
@@ -196,10 +189,7 @@ def hypervolume_sheet(results: Json) -> Sheet:
 
 @in_our_style
 def front_figure(results: Json) -> Figure:
-    """Draw one point for each choice of weights: mean harm of the line, and of the vehicle that bears most.
-
-    ``results``: the content of ``front.json``.
-    """
+    """Draw one point for each choice of weights: mean harm of the line, and of the vehicle that bears most."""
     beside = {name: [{"vehicles": vehicles}] for name, vehicles in results["beside"].items()}
     count, all_positive = results["harm_count"], True
     figure, (axes,) = new_panels(SIZE_IN)

@@ -90,11 +90,7 @@ def read_levels(names: Sequence[str], settings: CommandSettings) -> list[Level]:
 
 
 def sweep_levels(name: str, sweep: str, settings: CommandSettings, recipes: Sequence[TrainingRecipe]) -> list[Level]:
-    """One level for each value of a sweep, in ascending order; each is compared with the previous level.
-
-    Raises ``InvalidInput`` if the key does not belong to a scenario, if a setting or a recipe also sets it, or if
-    levels with different values of the key cannot be compared.
-    """
+    """One level for each value of a sweep, in ascending order; each is compared with the previous level."""
     values, levels = parse_sweep(sweep), list[Level]()
     key = values[0].key
     path = tuple(key.removeprefix("scenario.").split("."))
@@ -127,9 +123,8 @@ def sweep_levels(name: str, sweep: str, settings: CommandSettings, recipes: Sequ
 def parse_sweep(text: str) -> list[Swept]:
     """Read a sweep ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return its values in ascending order.
 
-    A word may precede the numbers, as in ``objective=social:0..90:15``. Numbers and ranges may be mixed. Raises
-    ``InvalidInput`` for any other text, a range whose length is not a multiple of its step, a repeated number, and
-    fewer than 2 or more than ``MOST_VALUES`` numbers.
+    A word may precede the numbers, as in ``objective=social:0..90:15``. Raises ``InvalidInput`` for any other text, a
+    range that is no multiple of its step, a repeated number, and fewer than 2 or more than ``MOST_VALUES`` numbers.
     """
     key, equals, values = (part.strip() for part in text.partition("="))
     match = WORD.match(values)
@@ -157,11 +152,10 @@ def parse_sweep(text: str) -> list[Swept]:
 
 
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[DrawnWorlds]:
-    """Draw the worlds of each level; world k has the same line of vehicles at all levels.
+    """Worlds of each level; world k has the same line of vehicles at all levels (in a sweep the same random numbers).
 
-    Levels may differ only in obstacles, weights of harm and, with different ``v2x``, latencies. Raises ``InvalidInput``
-    for any other difference. If a sweep varies a key of the vehicles, world k has the same random numbers at all
-    levels, but other vehicles.
+    Raises ``InvalidInput`` for levels that differ in more than obstacles, weights of harm and, with another ``v2x``,
+    latencies.
     """
     drawn_by_level = [level.scenario.draw(episodes, seed) for level in levels]
     if not levels[0].same_vehicles:

@@ -41,13 +41,11 @@ Json = dict[str, Any]
 
 
 def comparison(measured: Sequence[LevelResult], searched: int) -> Json:
-    """Comparison of the levels as plain data.
+    """Comparison of the levels as plain data; with the joint optimum, only in the first ``searched`` worlds.
 
     - ``levels``: results of each level and algorithm;
     - ``steps``: for each algorithm, the change of harm from each level's ``before`` to the level;
     - ``undertrained``: a sentence that names the levels whose trained policies do worse than full braking, if any.
-
-    The joint optimum is known only in the first ``searched`` worlds; comparisons with it use only these worlds.
     """
     steps = []
     for algorithm in dict.fromkeys(result.algorithm for result in measured if result.algorithm is not None):
@@ -147,11 +145,10 @@ def _borne_columns(result: LevelResult, column: str) -> list[Floats]:
     return [result.reached[f"{column}_{i}"] for i in range(1, result.level.scenario.vehicles + 1)]
 
 
-def write_ablation(plan: Ablation, measured: Sequence[LevelResult]) -> tuple[Json, list[Path]]:
-    """Write ``ablation.json``, ``ablation.csv`` and the figure; return the results and the paths of the files."""
+def ablation_results(plan: Ablation, measured: Sequence[LevelResult]) -> Json:
     recipes = zip(plan.algorithms, plan.recipes, strict=True)
     swept, machine = plan.levels[0].swept, this_machine()
-    results = {
+    return {
         "settings": {
             **{name: getattr(plan, name) for name in FULL},
             "recipes": {name: recipe.model_dump(mode="json") for name, recipe in recipes},
@@ -163,18 +160,19 @@ def write_ablation(plan: Ablation, measured: Sequence[LevelResult]) -> tuple[Jso
         "conditions": f"{conditions(plan, plan.episodes)} {machine}.",
         **comparison(measured, plan.search_episodes),
     }
+
+
+def write_ablation(plan: Ablation, measured: Sequence[LevelResult], results: Json) -> list[Path]:
+    """Write ``ablation.json``, ``ablation.csv`` and the figure; return the paths of the files."""
     json_file, csv_file, picture = (plan.folder / name for name in (JSON, CSV, FIGURE))
     write_output(json_file, f"{json.dumps(results, indent=2, allow_nan=False)}\n".encode(), force=True)
     write_output(csv_file, levels_csv(measured, plan.search_episodes).encode(), force=True)
     write_picture(picture, ablation_figure(results, conditions(plan, plan.search_episodes)), force=True)
-    return results, [json_file, csv_file, picture]
+    return [json_file, csv_file, picture]
 
 
 def conditions(plan: Ablation, number: int) -> str:
-    """Sentences that say how results were made: recipes, seeds, worlds, intervals, search of the joint optimum.
-
-    ``number``: number of worlds over which the means are.
-    """
+    """Sentences that say how the results over ``number`` worlds were made."""
     recipes = ", ".join(
         f"{name} (rewarded for {IN_WORDS[recipe.reward.harm_count]})"
         for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
@@ -193,9 +191,8 @@ def conditions(plan: Ablation, number: int) -> str:
 
 
 def levels_csv(measured: Sequence[LevelResult], searched: int) -> str:
-    """CSV text with one row for each level, algorithm and seed: the mean over worlds of each column of an evaluation.
-
-    The columns ``searched_*`` are means over the first ``searched`` worlds.
+    """CSV text with one row for each level, algorithm and seed: means; ``searched_*`` over the first ``searched``
+    worlds.
     """
     rows: list[Json] = []
     for result in measured:
@@ -217,7 +214,6 @@ SheetColumns = list[tuple[Column, str]]
 
 
 def tables(results: Json) -> list[Sheet]:
-    """Tables for each count of harm: levels, distance to the joint optimum, and steps between levels."""
     swept, levels = results["settings"]["swept"], results["levels"]
     several = len(results["settings"]["recipes"]) > 1
     algorithm: SheetColumns = [(Column("Algorithm", text=True), "algorithm")] if several else []
@@ -249,9 +245,8 @@ def tables(results: Json) -> list[Sheet]:
 
 
 def sheet(title: str, rows: Sequence[Json], columns: SheetColumns) -> Sheet:
-    """Table with one row for each mapping of ``rows``. Each column has a path to its values in a row.
-
-    The path ``first harm`` means ``row["first"]["harm"]``.
+    """Table with one row for each mapping of ``rows``. The path ``first harm`` of a column means
+    ``row["first"]["harm"]``.
     """
     cells: list[list[Any]] = []
     for row in rows:
@@ -270,10 +265,9 @@ def share(heading: str) -> Column:
 
 @in_our_style
 def ablation_figure(results: Json, caption: str) -> Figure:
-    """Bars of the minimised harm or cost at each level or swept value, with 95 % intervals.
+    """Bars of what is minimised at each level or swept value, with 95 % intervals; a panel for each count.
 
-    A panel for each count that a recipe minimises, with the means above the bars; a bar far above full braking at most
-    levels is cut. All means are over the worlds in which the joint optimum is known.
+    A bar far above full braking at most levels is cut. Means are over the worlds in which the joint optimum is known.
     """
     levels, recipes = results["levels"], results["settings"]["recipes"]
     names = list(dict.fromkeys(level["level"] for level in levels))

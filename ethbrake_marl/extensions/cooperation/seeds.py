@@ -23,11 +23,10 @@ CONFIDENCE = 0.95
 
 
 def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None) -> Estimate:
-    """Mean over seeds and worlds of ``values``, or of ``values - baseline``, [seeds, worlds] each.
+    """Mean over seeds and worlds of ``values``, or of ``values - baseline``.
 
-    A share (truth values without a baseline) always has an interval. It contains Wilson's interval, because bootstrap
-    intervals of nearly constant values are too narrow. Any other estimate has none if there is only one world or
-    recording, or if all values are 0 and there is no baseline.
+    The interval of a share contains Wilson's, because bootstrap intervals of nearly constant values are too narrow. Any
+    other estimate has none with one world or recording, or if all values are 0 without a baseline.
     """
     array = np.atleast_2d(np.asarray(values))
     sides = [array, np.zeros((1, array.shape[1])) if baseline is None else np.atleast_2d(baseline)]
@@ -51,8 +50,7 @@ def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None
 def share_over_seeds(values: Floats, worst: Floats, best: Floats, clusters: Clusters = None) -> Estimate | None:
     """Share of the possible reduction ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``.
 
-    All arguments are [seeds, worlds]. The result is None if ``mean(best) >= mean(worst)``, or if at least 5 % of the
-    resamples leave almost nothing to reduce.
+    None if ``mean(best) >= mean(worst)``, or if at least 5 % of the resamples leave almost nothing to reduce.
     """
     sides = [np.atleast_2d(array) for array in (values, worst, best)]
     reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
@@ -74,11 +72,7 @@ def share_over_seeds(values: Floats, worst: Floats, best: Floats, clusters: Clus
 def _interval(
     sides: Sequence[Floats], of: Callable[[Floats], Floats], clusters: Clusters
 ) -> tuple[float, float] | None:
-    """Confidence interval of a statistic; None if there is only one world or recording.
-
-    ``sides``: arguments of the statistic, [seeds, worlds] each. ``of``: the statistic, a function of the arguments'
-    means [resamples, arguments].
-    """
+    """Confidence interval of a statistic ``of`` means [resamples, arguments]; None with one world or recording."""
     cluster = np.arange(sides[0].shape[1]) if clusters is None else np.unique(clusters, return_inverse=True)[1]
     if cluster.max() == 0:
         return None
@@ -88,10 +82,7 @@ def _interval(
 
 
 def _resampled_means(sides: Sequence[Floats], cluster: Ints) -> Floats:
-    """Means of the arguments in random resamples of worlds (or recordings) and seeds, [RESAMPLES, arguments].
-
-    ``cluster`` [worlds]: number of each world's recording. All arguments have the same resampled worlds.
-    """
+    """Means of the arguments in the same random resamples of worlds or recordings, [RESAMPLES, arguments]."""
     worlds, number, rng = len(cluster), int(cluster.max()) + 1, np.random.default_rng(0)
     means, chunk = np.empty((RESAMPLES, len(sides))), max(1, RESAMPLES_AT_ONCE // worlds)
     for begin in range(0, RESAMPLES, chunk):

@@ -40,13 +40,11 @@ def to_parquet(
     reward: Any = "harm",
     force: bool = False,
 ) -> None:
-    """Let agents drive, and write a Parquet file with one row for each agent, world and decision.
+    """Let each of ``agents`` drive all learners in the worlds 0 to ``episodes`` - 1; write a row per agent, world,
+    decision.
 
-    Every agent of ``agents`` controls all learners, in the worlds 0 to ``episodes`` - 1 of ``seed``. ``reward``: a name
-    such as ``harm``, or the weights of the reward's terms. docs/data.md describes the file.
-
-    Raises ``InvalidInput`` for an invalid argument, ``AlreadyExists`` if the file exists and ``force`` is false, and
-    ``MissingExtra`` if pyarrow is not installed.
+    docs/data.md describes the file. Raises ``InvalidInput`` for an invalid argument, ``AlreadyExists`` if the file
+    exists and ``force`` is false, and ``MissingExtra`` without pyarrow.
     """
     loaded, game = open_game(scenario, reward=reward)
     if not loaded.learners:
@@ -86,7 +84,7 @@ def to_parquet(
 
 
 def rounded_actions(team: Team, game: Game, alert: State) -> list[Observations]:
-    """Commands of a team that drives n worlds, as float32 actions of the L learners, [n, L] for each decision."""
+    """Commands of a team as float32 actions of the L learners, [n, L] for each decision."""
     learners = game.settings.learners
     return [
         actions_of(state, learners, state.wanted[:, learners]).astype(np.float32)
@@ -96,9 +94,8 @@ def rounded_actions(team: Team, game: Game, alert: State) -> list[Observations]:
 
 
 def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator[dict[str, Any]]:
-    """Rows of the file, as columns: for each decision, name -> one value for each world whose episode has not ended.
-
-    ``actions``: actions of the L learners, [n, L] for each decision; then learners repeat their last actions.
+    """Columns of the file for each decision, name -> a value for each world that has not ended, under ``actions`` [n,
+    L].
     """
     state, learners = game.reset(alert), game.settings.learners.tolist()
     while not state.ended.all():

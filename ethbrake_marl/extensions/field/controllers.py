@@ -36,9 +36,8 @@ class Parameters:
 
 
 class KnownMotion(NamedTuple):
-    """What one vehicle knows in n worlds: its own motion, and the motion of the vehicle or obstacle ahead.
-
-    If nothing is ahead, or the vehicle knows nothing of it, the gap is infinite.
+    """What one vehicle knows in n worlds of itself and of what is ahead. The gap to nothing, or to the unknown, is
+    infinite.
     """
 
     gap_m: Floats  # [n] gap to the vehicle or obstacle ahead
@@ -50,10 +49,7 @@ class KnownMotion(NamedTuple):
 
     @classmethod
     def of(cls, state: State, body: int, step_s: float) -> KnownMotion:
-        """What the vehicle ``body`` knows.
-
-        ``state``: the worlds as this vehicle estimates them. ``step_s``: time until the next decision (s).
-        """
+        """What ``body`` knows in the worlds that it estimates. ``step_s``: time until the next decision (s)."""
         line, ahead = state.line, body - 1
         is_known = state.know[:, body, ahead] <= state.time_s if ahead else line[:, GAP, 0] < FAR_M
         front, force = np.where(is_known, line[:, [SPEED, FORCE], ahead].T, 0.0)
@@ -67,17 +63,17 @@ class KnownMotion(NamedTuple):
 
     @property
     def until_contact_s(self) -> Floats:
-        """Time until contact with the vehicle ahead at present speeds, [n] s; infinite if the gap does not close."""
+        """Time until contact at present speeds, [n] s; infinite if the gap does not close."""
         closing = self.closing_mps
         return np.where(closing > 0.0, self.gap_m / np.where(closing > 0.0, closing, 1.0), np.inf)
 
     @property
     def headway_s(self) -> Floats:
-        """Gap ahead divided by the vehicle's own speed, [n] s; infinite if this speed is not above 0."""
+        """Gap ahead divided by the own speed, [n] s; infinite if this speed is not above 0."""
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """The command ``wanted_mps2``, but with a deceleration that grows by at most ``rate_mps3``, [n] m/s2."""
+        """``wanted_mps2``, but with a deceleration that grows by at most ``rate_mps3``, [n] m/s2."""
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
 
@@ -224,10 +220,9 @@ LAWS: dict[str, Law] = {
 class Controller:
     """Agent that follows a ``Law``.
 
-    Its memory is the time at which the present danger began, [n] s: infinite without a danger, NaN before the first
-    decision. A danger begins when the law notices it, and then the vehicle's reaction time begins. A danger at the
-    first decision begins at the alert, so its reaction time overlaps with the latency. A danger ends when the law no
-    longer notices it or, if ``law.stays``, never.
+    Memory: time at which the present danger began, [n] s: infinite without a danger, NaN before the first decision.
+    Then the reaction time begins; at the first decision, both begin at the alert. A danger ends when the law no longer
+    notices it or, if ``law.stays``, never.
     """
 
     knows = MESSAGES
@@ -237,7 +232,7 @@ class Controller:
         self.name, self.law, self.parameters, self.step_s = name, law, Parameters(**parameters), step_s
 
     def check(self, game: Game, body: int) -> None:
-        """Raise ``InvalidInput`` if the time step of the game is not the one for which the controller was made."""
+        """Raise ``InvalidInput`` for a game of another time step than the controller's."""
         step_s = game.settings.time_step_s
         if not math.isclose(step_s, self.step_s):
             raise InvalidInput(
@@ -269,10 +264,8 @@ class Controller:
 
 
 def make_controller(argument: str | None, settings: Any) -> Controller:
-    """Controller with the name ``settings.spec``, such as ``idm:T=1.0``.
-
-    ``argument``: values of parameters, such as ``T=1.0:a=2``; None: default values. Raises ``UnknownName`` for a
-    parameter that the law does not have, and ``InvalidInput`` for a bad value.
+    """Controller such as ``idm:T=1.0``. Raises ``UnknownName`` for an unknown parameter, ``InvalidInput`` for a bad
+    value.
     """
     law, where = LAWS[settings.spec.partition(":")[0]], f"agent {settings.spec!r}"
     parameters: dict[str, float] = {}

@@ -49,10 +49,9 @@ CURVES = {
 
 
 def risks(changes: Floats, curve: str) -> Floats:
-    """Probability of an injury in each vehicle by an impact at its front, and at its rear, [n, 2, N].
+    """Probability of an injury in each vehicle by an impact at its front, and at its rear, [n, 2, N]; 0 if not hit.
 
-    ``changes`` [n, 2, N]: the vehicle's change of speed by an impact at its front, and at its rear (m/s). Where a
-    vehicle was not hit the probability is 0. ``curve``: a name in ``CURVES``.
+    ``changes`` [n, 2, N]: change of speed by each (m/s). ``curve``: a name in ``CURVES``.
     """
     side_risks = [CURVES[curve].front(changes[:, 0].copy()), CURVES[curve].rear(changes[:, 1].copy())]
     return np.where(changes > 0.0, np.stack(side_risks, axis=1), 0.0)
@@ -61,8 +60,7 @@ def risks(changes: Floats, curve: str) -> Floats:
 def expected_injuries_by_harm(harm: Harm, vehicle: int, curve: str) -> Floats:
     """Expected injuries in 1,000 lines, [n], as if a single impact had done the whole harm of each pair.
 
-    A vehicle that is hit on both sides counts with the larger of its two risks. The result is exact for first impacts
-    of two vehicles, and too large if several impacts of a pair add up.
+    Of two sides the larger risk counts. Exact for first impacts of two vehicles, too large if several impacts add up.
     """
     rebound = (1.0 + harm.car[:, RESTITUTION, :-1]) * np.sqrt(harm.pairs[:, :-1])
     mass = harm.car[:, MASS, 1:]
@@ -76,7 +74,7 @@ def expected_injuries_by_harm(harm: Harm, vehicle: int, curve: str) -> Floats:
 def speed_changes(before: State, after: State) -> Floats:
     """Largest change of each vehicle's speed by one impact at its front, and at its rear, [n, 2, N] m/s.
 
-    Impacts between the two states count; there must be no decision between them. Pushing in contact is not an impact.
+    There must be no decision between the two states. Pushing in contact is not an impact.
     """
     out = np.zeros((after.n, 2, after.vehicles))
     struck = np.asarray((after.line[:, IMPACTS] > before.line[:, IMPACTS]).any(axis=1))
@@ -86,11 +84,7 @@ def speed_changes(before: State, after: State) -> Floats:
 
 
 def expected_injuries(changes: Floats, curve: str) -> Floats:
-    """Expected injuries of each vehicle in 1,000 lines, [n, N].
-
-    ``changes`` [n, 2, N] (m/s): results of ``speed_changes``. Only the side (front or rear) with the larger change
-    counts.
-    """
+    """Expected injuries of each vehicle in 1,000 lines, [n, N]; the larger ``changes`` [n, 2, N] (m/s) counts."""
     front, rear = np.moveaxis(risks(changes, curve), 1, 0)
     return np.asarray(1_000.0 * np.where(changes[:, 1] >= changes[:, 0], rear, front))
 

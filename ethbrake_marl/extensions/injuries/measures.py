@@ -19,8 +19,6 @@ from ethbrake_marl.registry import Part
 
 
 class Injuries:
-    """Measure that watches each vehicle's largest change of speed by one impact, at its front and at its rear."""
-
     def __init__(self, curve: str, game: Game, alert: State) -> None:
         self.curve, self.changes = curve, np.zeros((alert.n, 2, alert.vehicles))
 

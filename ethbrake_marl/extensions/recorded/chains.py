@@ -26,10 +26,9 @@ class Chains(NamedTuple):
 
 
 def cut_chains(recording: Recording, vehicles: int) -> Chains:
-    """Chains of ``vehicles`` vehicles in a recording, ordered by time and by the queue's front vehicle.
+    """Chains in a recording, by time and front vehicle of the queue. Each begins directly behind the chain before.
 
-    The first chain of a queue begins with the front vehicle of the queue, and every later chain directly behind the
-    chain before. Raises ``InvalidInput`` if too many vehicles have faulty data.
+    Raises ``InvalidInput`` if too many vehicles have faulty data.
     """
     left_out = Counter[str]()
     states = recording.states[~recording.states.duplicated(["moment", "vehicle"])].reset_index(drop=True)
@@ -61,10 +60,10 @@ def cut_chains(recording: Recording, vehicles: int) -> Chains:
 
 
 def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
-    """Rows of ``states`` in which a vehicle follows another one, with two more columns: ``gap`` (m) and ``front_car``.
+    """Rows of ``states`` in which a vehicle follows another one, with ``gap`` (m) and ``front_car`` (row of the vehicle
+    ahead).
 
-    ``front_car`` is the row of the vehicle ahead. If several vehicles follow the same one, only the nearest is kept.
-    Links that are left out are counted in ``left_out``.
+    Of several followers of one vehicle, only the nearest is kept. ``left_out`` counts the others.
     """
     entry = recording.entry
     if entry.by_lane:
@@ -94,9 +93,9 @@ def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
 
 
 def _check_faults(recording: Recording, faulty: Any, left_out: Counter[str]) -> None:
-    """Count faulty data in ``left_out``, or raise ``InvalidInput`` if their share exceeds the format's limit.
+    """Count vehicles that overlap the one ahead, or whose vehicle ahead is not recorded.
 
-    ``faulty``: rows of vehicles that overlap the vehicle ahead, or whose vehicle ahead is not recorded.
+    Raises ``InvalidInput`` if their share exceeds the format's limit.
     """
     states = recording.states
     twice = states[states.duplicated(["moment", "vehicle"])]

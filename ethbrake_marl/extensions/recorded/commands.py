@@ -66,10 +66,11 @@ def from_data_command(
         )
         for message in result.refused:
             out.note(f"refused: {message}")
-        with new_file(output) as partial:
-            partial.write_text(result.text, "utf-8")
-            out.write(rows, result.csv, what="rows")
-        out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
+        with out.writing():
+            with new_file(output) as partial:
+                partial.write_text(result.text, "utf-8")
+                out.write(rows, result.csv, what="rows")
+            out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
         lists = {"found": result.found, "refused": result.refused, "skipped": result.skipped}
         out.result({"scenario": str(output), "rows": str(rows), **lists}, *result.found, in_file=True)
 

@@ -93,10 +93,10 @@ _ROLES = ("time", "vehicle", "lane", "front", "length", "speed")  # keys of ``--
 def format_of(name: DataFormat, columns: str = "") -> Format:
     """Format of recorded traffic called ``name``.
 
-    ``columns`` describes the format ``table``: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. All
-    values except that of ``units`` are names of columns. ``time=t/1000`` means that the column ``t`` is in 1/1000 s.
-    ``units`` is ``m`` (m and m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h). Raises ``InvalidInput`` for missing,
-    repeated or unknown keys, for unknown units, and for ``columns`` with any other format.
+    ``columns`` describes the format ``table``: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``.
+    ``time=t/1000``: the column ``t`` is in 1/1000 s. ``units``: ``m`` (m and m/s), ``ft`` (ft and ft/s) or ``km/h`` (m
+    and km/h). Raises ``InvalidInput`` for missing, repeated or unknown keys and units, and for ``columns`` with another
+    format.
     """
     if name != "table":
         if columns:

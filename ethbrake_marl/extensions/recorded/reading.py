@@ -29,10 +29,7 @@ class NotARecording(InvalidInput):
 
 
 class Cells(NamedTuple):
-    """Columns of a recorded file that its format uses.
-
-    The index of ``frame`` is the number of the row in the file, from 0.
-    """
+    """Columns of a recorded file that its format uses. Index of ``frame``: number of the row in the file, from 0."""
 
     file: Path
     names: Mapping[str, str]  # quantity -> name of its column; for numbered columns ``speed1``, ``speed2``, ...
@@ -46,10 +43,7 @@ class Cells(NamedTuple):
         return f"{self.file}, line {line}{f', column {self.names[quantity]}' if quantity else ''}"
 
     def refuse(self, bad: Any, quantity: str, values: Any, right: str) -> None:
-        """Raise ``InvalidInput`` with file, line and column of the first bad value, if there is one.
-
-        ``bad``, ``values``: mask and values, series with the row's number as index. ``right``: what a valid value is.
-        """
+        """Raise ``InvalidInput`` with file, line and column of the first value in the mask ``bad``, if there is one."""
         if bad.any():
             row = bad.idxmax()
             raise InvalidInput(f"{self.place(row, quantity)}: {values[row]:.12} {right}")
@@ -57,7 +51,7 @@ class Cells(NamedTuple):
 
 @contextmanager
 def reading(file: Path) -> Iterator[BufferedReader]:
-    """Context manager that opens a file. Errors of pyarrow, and bytes that are no text, become ``InvalidInput``."""
+    """Open a file. Errors of pyarrow, and bytes that are no text, become ``InvalidInput``."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             yield stream
@@ -67,11 +61,10 @@ def reading(file: Path) -> Iterator[BufferedReader]:
 
 
 def read_cells(file: Path, entry: Format) -> Cells:
-    """Columns of a recorded file that its format ``entry`` uses; lines before the header are ignored.
+    """Columns that the format ``entry`` uses, without lines before the header and without ``entry.streets``.
 
-    Rows whose Location is one of ``entry.streets`` are left out. Raises ``InvalidInput``, with file, line and column,
-    if a column is missing or occurs twice, and for a cell that is empty or not a number; ``NotARecording`` if more than
-    half of the columns are missing.
+    Raises ``InvalidInput``, with file, line and column, for a missing or repeated column, and a cell that is empty or
+    not a number; ``NotARecording`` if more than half of the columns are missing.
     """
     with reading(file) as stream:
         heading, separator, names, at = _header(file, entry, stream)
@@ -98,10 +91,11 @@ def read_cells(file: Path, entry: Format) -> Cells:
 
 
 def _header(file: Path, entry: Format, stream: BufferedReader) -> tuple[int, str, Sequence[str], dict[str, int]]:
-    """Line number of the header (from 1), separator, names of all columns, and quantity -> place of its column.
+    """Line number of the header (from 1), separator, names of all columns, and quantity -> place of its column (from
+    0).
 
-    Places count from 0. The header is the first line that has all columns of the format. Without such a line, raises
-    ``NotARecording`` if the best line lacks more than half of the columns, else ``InvalidInput``.
+    The header is the first line with all columns of the format. Without one, raises ``NotARecording`` if the best line
+    lacks more than half of them, else ``InvalidInput``.
     """
     missing = list(entry.columns.values())
     for number in range(1, HEADER_LINES + 1):
@@ -117,10 +111,7 @@ def _header(file: Path, entry: Format, stream: BufferedReader) -> tuple[int, str
 
 
 def _match(file: Path, entry: Format, names: Sequence[str]) -> tuple[dict[str, int], list[str]]:
-    """Quantity -> place of its column in ``names`` (from 0), and the format's columns that ``names`` lacks.
-
-    Raises ``InvalidInput`` if no column is missing and one occurs twice.
-    """
+    """Quantity -> place of its column in ``names`` (from 0), and the format's columns that ``names`` lacks."""
     at, missing, twice = dict[str, int](), list[str](), list[str]()
     for quantity, column in entry.columns.items():
         pattern = re.escape(column.lower()).replace(re.escape(VEHICLE_PLACEHOLDER), "([1-9][0-9]*)")
@@ -139,10 +130,7 @@ def _match(file: Path, entry: Format, names: Sequence[str]) -> tuple[dict[str, i
 
 
 def _numbers(cells: Cells, quantity: str, column: Any, may_be_empty: bool) -> Any:
-    """Cells of a column as numbers; commas may group thousands. Empty cells become NaN if they are allowed.
-
-    Raises ``InvalidInput`` with file, line and column of the first cell that is not a finite number.
-    """
+    """Cells of a column as numbers; commas may group thousands. Empty cells become NaN if they are allowed."""
     try:
         values = column.cast(pyarrow.float64()).to_numpy()
     except pyarrow.ArrowException:

@@ -81,21 +81,12 @@ def scenario_from_data(
 ) -> FromData:
     """Create a scenario from the recordings in a folder and its subfolders; each world is a recorded chain of vehicles.
 
-    At regular times, each queue (vehicles that follow each other) is cut into chains, from its front vehicle on. A
-    chain has as many vehicles as the scenario ``based_on``. The gaps and speeds of a chain are one row of the new
-    scenario's table. If there are more rows than a table may have, only every k-th row is used.
+    Every ``every_s`` seconds, each queue is cut into chains of as many vehicles as the scenario ``based_on`` has, which
+    supplies what is not recorded. If there are more rows than a table may have, every k-th is used.
 
-    Args:
-        name: name of the scenario.
-        folder: folder with the files, or one file.
-        format: format of the files.
-        columns: which column has which role, for the format ``table`` only (``format_of``).
-        based_on: scenario that provides the number of vehicles and all quantities that are not recorded.
-        every_s: time between two moments at which chains are formed, s.
-        progress: called with the word ``files``, the number of files read so far, and the number of all files.
-
-    Raises ``InvalidInput`` for an invalid argument and, with file, line and column, if no file can be used.
-
+    ``columns``: for the format ``table`` (``format_of``). ``progress``: called with ``files``, the number of files
+    read, and of all. Raises ``InvalidInput`` for an invalid argument and, with file, line and column, if no file can be
+    used.
     """
     entry, base = format_of(format, columns), load_scenario(based_on)
     check_file_name("scenario", name)
@@ -135,11 +126,10 @@ def scenario_from_data(
 def read_chains(
     folder: Path, entry: Format, every_s: float, vehicles: int, progress: Callable[[str, int, int], None]
 ) -> ChainRows:
-    """Chains of ``vehicles`` vehicles in all recordings of a folder and its subfolders, or in one file.
+    """Chains of all recordings of a folder and its subfolders, or of one file.
 
-    Chains are formed every ``every_s`` seconds. A file with an error is refused as a whole; a copy of another file is
-    skipped. ``progress``: as in ``scenario_from_data``. Raises ``InvalidInput`` if there is no recording of the format
-    ``entry``, or no chain.
+    A file with an error is refused as a whole; a copy of another file is skipped. Raises ``InvalidInput`` if there is
+    no recording of the format, or no chain.
     """
     longest, left_out, refused, skipped = 0, Counter[str](), list[str](), list[str]()
     numbers, of, digests, format_errors = (
@@ -196,8 +186,8 @@ def read_chains(
 def files_of(folder: Path, entry: Format, refused: list[str]) -> dict[str, Path]:
     """Files in a folder and its subfolders whose names fit a format: printable name -> path.
 
-    ``folder`` may be one file, with any name. A subfolder that cannot be read adds an error message to ``refused``.
-    Names that begin with a dot, and links to folders, are ignored.
+    ``folder`` may be one file, with any name. Hidden files and links to folders are ignored. A subfolder that cannot be
+    read adds a message to ``refused``.
     """
     if not folder.is_dir():
         return {plain_text(folder.name): folder} if folder.is_file() else {}

@@ -48,8 +48,8 @@ class Recording(NamedTuple):
 def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
     """States of the vehicles in a file every ``every_s`` seconds, from the file's first moment on.
 
-    Raises ``InvalidInput``, with file, line and column, for an impossible value such as a length of 0 m, and if
-    positions contradict the speeds.
+    Raises ``InvalidInput``, with file, line and column, for an impossible value, and if positions contradict the
+    speeds.
     """
     cells, names = read_cells(file, entry), dict[float, str]()
     raw = cells.frame
@@ -77,11 +77,10 @@ def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
 
 
 def moments(times_s: Floats, every_s: float) -> Floats:
-    """Number of the moment for which each recorded time is used, [rows] floats; -1: the recorded time is not used.
+    """Number of the moment for which each recorded time is used, [rows] floats; -1: not used.
 
-    Moment k is the time ``min(times_s) + k every_s``. It uses the nearest recorded time that is at most half a
-    recording step away. The recording step is the smallest difference between recorded times. Raises ``InvalidInput``
-    if ``every_s`` is less than the recording step.
+    Moment k, ``min(times_s) + k every_s``, uses the nearest recorded time, at most half a recording step (the smallest
+    difference between recorded times) away. Raises ``InvalidInput`` if ``every_s`` is less than this step.
     """
     recorded, back = np.unique(np.round(times_s - times_s.min(), 6), return_inverse=True)
     step = np.diff(recorded).min(initial=every_s if len(recorded) == 1 else np.inf)
@@ -101,10 +100,7 @@ def moments(times_s: Floats, every_s: float) -> Floats:
 
 
 def _number_names(raw: Any, cells: Cells) -> dict[float, str]:
-    """Names of vehicles and lanes, number -> name; in ``raw``, the numbers replace them.
-
-    Raises ``InvalidInput`` for an empty name.
-    """
+    """Names of vehicles and lanes, number -> name; in ``raw``, the numbers replace them."""
     for column in ("vehicle", "lane"):
         cells.refuse(raw[column] == "", column, raw[column], "must be a name")
     text = pd.concat([raw["vehicle"], raw["lane"]]).drop_duplicates()
@@ -133,11 +129,7 @@ def _along_road(raw: Any, cells: Cells, entry: Format) -> Any:
 
 
 def _turn_highd(states: Any, cells: Cells) -> None:
-    """Turn highD's positions into fronts that grow, and speeds into positive ones, in the direction of travel; in
-    place.
-
-    A position in highD is the left edge of a vehicle, and grows to the right whichever way the vehicle drives.
-    """
+    """Turn highD's positions (left edges, whichever way a vehicle drives) into fronts that grow, in place."""
     meta = read_cells(Path(f"{str(cells.file)[:-4]}Meta.csv"), HIGHD_META).frame
     direction = states["vehicle"].map(meta.drop_duplicates("vehicle").set_index("vehicle")["direction"])
     right = "must have the drivingDirection 1 or 2 in its tracksMeta.csv"
@@ -170,10 +162,7 @@ def _check(states: Any, cells: Cells, entry: Format) -> None:
 
 
 def _check_positions(recording: Recording, every_s: float) -> None:
-    """Raise ``InvalidInput`` if, in some lane, positions change much more or less than speeds imply, or backwards.
-
-    ``every_s``: time between two moments of the recording (s).
-    """
+    """Raise ``InvalidInput`` if, in some lane, positions change much more or less than speeds imply, or backwards."""
     cells, entry, now = recording.cells, recording.entry, recording.states
     then = now[["moment", "vehicle", "lane", "front", "side", "speed"]].assign(moment=now["moment"] + 1.0)
     pairs = now.merge(then, on=["moment", "vehicle", "lane"], suffixes=("", "_then"))
@@ -191,10 +180,11 @@ def _check_positions(recording: Recording, every_s: float) -> None:
 
 
 def _openacc(raw: Any, cells: Cells, entry: Format) -> Any:
-    """States of cars whose speeds and gaps were recorded in numbered columns.
+    """States of cars whose speeds and gaps were recorded in numbered columns; a position is minus the sum of the gaps
+    ahead.
 
     Car k + 1 follows car k if the speeds of both cars and the gap between them (column ``IVS`` with the number k) are
-    recorded. The position of a car is minus the sum of the recorded gaps ahead of it.
+    recorded.
     """
     cars = sorted(int(name.removeprefix("speed")) for name in raw if name.startswith("speed"))
     gap_of = {k: f"gap{k - 1}" for k in cars if k - 1 in cars and f"gap{k - 1}" in raw}

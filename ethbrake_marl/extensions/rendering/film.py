@@ -26,7 +26,7 @@ ROAD = 160  # height (pixels) of title, gaps and road, the upper part of a pictu
 
 
 def film_scenes(world: State, team: Team, game: Game) -> list[Scene]:
-    """Scenes of one world that a team drives: 25 per second from the alert on, and the end of the episode."""
+    """Scenes of one world that a team drives: 25 per second from the alert on, and the end."""
     motion, scenes = Motion(game, world, 0), list[Scene]()
     for _, state in play(game, world, team):
         motion.step(state)
@@ -42,9 +42,8 @@ def films_of(world: State, teams: Mapping[str, Team], game: Game) -> Films:
 
 
 def check_film(ending: str) -> None:
-    """Raise ``InvalidInput`` for a file ending other than .gif, .mp4 and .png.
-
-    Raise ``MissingExtra`` for .mp4 if imageio-ffmpeg is not installed.
+    """Raise ``InvalidInput`` for an ending other than .gif, .mp4, .png; ``MissingExtra`` for .mp4 without
+    imageio-ffmpeg.
     """
     if ending not in WRITERS:
         raise InvalidInput(f"film with the file ending {ending!r}: the ending must be one of {', '.join(WRITERS)}")
@@ -56,7 +55,7 @@ Films = Mapping[str, Sequence[Scene]]  # title -> scenes, of one world
 
 
 def stack_films(films: Films) -> Iterator[Frame]:
-    """Pictures of all films, one below the other. A film that ends early shows its last scene until all have ended."""
+    """Pictures of all films, one below the other. A film that ends early shows its last scene."""
     for k in range(max(map(len, films.values()))):
         frame_scenes = (scenes[min(k, len(scenes) - 1)]._replace(title=title) for title, scenes in films.items())
         yield np.concatenate([picture(scene) for scene in frame_scenes])
@@ -75,10 +74,7 @@ def write_gif(films: Films) -> bytes:
 
 
 def show_in_window(films: Films) -> None:
-    """Play films in a window, one below the other, until their end or until the user closes the window.
-
-    Raises ``MissingExtra`` without pygame-ce, and ``InvalidInput`` if no window can be opened.
-    """
+    """Play films in a window until their end or until the user closes it. Raises the errors of ``Screen``."""
     drawn = stack_films(films)
     frames = [next(drawn)]
     screen = Screen(frames[0])
@@ -115,7 +111,7 @@ def write_mp4(films: Films) -> bytes:
 
 
 def write_png(films: Films) -> bytes:
-    """Content of a PNG file: for each film, the alert, the hardest impact under any team, and the end."""
+    """PNG file: for each film, the alert, the hardest impact under any team, and the end."""
     from PIL import Image
 
     numbered = [(k, scene) for scenes in films.values() for k, scene in enumerate(scenes)]

@@ -47,12 +47,12 @@ def text_width(words: str, size: int) -> float:
 
 
 def fitting(choices: Sequence[str], width: float, size: int) -> str:
-    """First of the texts ``choices`` that is at most ``width`` pixels wide in the font size ``size``, else the last."""
+    """First of ``choices`` that is at most ``width`` pixels wide in the font size ``size``, else the last."""
     return next((words for words in choices if text_width(words, size) <= width), choices[-1])
 
 
 class Pen:
-    """Tool that draws one scene. Coordinates are in pixels of the finished picture; places on the road are in m."""
+    """Draws one scene. Coordinates are in pixels of the finished picture; places on the road are in m."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.fronts_m, (self.left_m, self.right_m) = scene, scene.fronts_m, scene.shown_m
@@ -123,7 +123,6 @@ def draw_road(pen: Pen) -> None:
 
 
 def draw_vehicle(pen: Pen, body: int) -> None:
-    """Draw a vehicle on the road, with red lights while it brakes, and a triangle above it if it is a learner."""
     left, right = pen.ends(body)
     pen.box(left, LANE - BODY, right, LANE + BODY, vehicle_colour(body))
     glass = left + (right - left) * 0.72
@@ -138,7 +137,6 @@ def draw_vehicle(pen: Pen, body: int) -> None:
 
 
 def draw_panel(pen: Pen, body: int) -> None:
-    """Draw a vehicle's speed, and its command as a bar that extends left for braking and right for driving."""
     scene, count = pen.scene, len(pen.scene.wanted) - 1
     gap = 24.0 if count <= 5 else 10.0
     width = min((WIDTH - 2 * MARGIN - gap * (count - 1)) / count, 240.0)

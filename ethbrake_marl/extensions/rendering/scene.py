@@ -65,13 +65,13 @@ class Scene(NamedTuple):
 
     @property
     def fronts_m(self) -> list[float]:
-        """Places of the front bumpers, front to rear (m). Gaps are true, and every vehicle is drawn ``BODY_M`` long."""
+        """Places of the front bumpers (m). Gaps are true, and every vehicle is drawn ``BODY_M`` long."""
         behind = np.concatenate([[0.0], np.cumsum(self.line[GAP, 1:-1] + BODY_M)])
         return [float(self.front_m - way) for way in behind]
 
     @property
     def shown_m(self) -> tuple[float, float]:
-        """Both ends of the road to draw (m): ``road_m``, moved forward and widened until it holds the whole line."""
+        """Both ends of the road to draw (m): ``road_m``, moved and widened until it holds the whole line."""
         (left, right), fronts = self.road_m, self.fronts_m
         on = max(fronts[0] + AHEAD_M - right, 0.0)
         return min(left + on, fronts[-1] - BODY_M - BEHIND_M), right + on
@@ -85,11 +85,11 @@ class Scene(NamedTuple):
         return self.front_m + float(self.line[GAP, 0])
 
     def command(self, body: int) -> float:
-        """Command of a vehicle that is in effect (m/s2); 0 before the vehicle's latency has elapsed."""
+        """Command in effect (m/s2); 0 before the vehicle's latency has elapsed."""
         return float(self.wanted[body]) if self.car[LATENCY, body] <= self.time_s else 0.0
 
     def share(self, body: int) -> float:
-        """Command in effect as an action: -1 brakes as hard as the vehicle can, 1 drives as hard as it can."""
+        """Command in effect as an action in [-1, 1]."""
         return float(action_of(self.car, body, self.command(body)))
 
     def said_of(self, body: int) -> str:
@@ -109,7 +109,6 @@ class Scene(NamedTuple):
         return f"harm {first:.2f} by first impacts, {total:.2f} in total (m2/s2)"
 
     def text(self) -> str:
-        """Scene as plain text: clock, road, one line for each vehicle, harm, and recent impacts."""
         left, right = self.shown_m
 
         def column(place_m: float) -> int:
@@ -133,10 +132,7 @@ class Scene(NamedTuple):
 
 
 class Motion:
-    """Exact motion of one world between two decisions, from which scenes are taken.
-
-    Raises ``InvalidInput`` for a world of another physics.
-    """
+    """Exact motion of one world between two decisions. Raises ``InvalidInput`` for a world of another physics."""
 
     def __init__(self, game: Game, state: State, row: int) -> None:
         require(state, "a picture", simulates=True)
@@ -151,10 +147,7 @@ class Motion:
         self.wanted, self.ended = state.wanted[self.row].copy(), bool(state.ended[self.row])
 
     def at(self, time_s: float) -> tuple[Floats, float, tuple[Impact, ...]]:
-        """Array ``line``, place of Vehicle 1's front bumper (m), and recent impacts at a time within this motion.
-
-        ``time_s``: seconds after the alert.
-        """
+        """``line``, place of Vehicle 1's front bumper (m), and recent impacts, ``time_s`` after the alert."""
         line = self.line.copy()
         line[GAP, 0] = ahead_m = min(line[GAP, 0], SCENE_POST_M)
         counts, scratch = line[IMPACTS].copy(), scratch_for(len(self.wanted))
@@ -180,9 +173,8 @@ class Motion:
 
 
 def whole_road(state: State, row: int) -> tuple[float, float]:
-    """Both ends (m) of the road that the line needs until it rests, if all vehicles brake fully as soon as they can.
-
-    A vehicle that would stop farther ahead than the vehicles before it is assumed to push them that far.
+    """Both ends (m) of the road that the line needs until it rests if all brake fully; nobody stops ahead of those in
+    front.
     """
     speeds, braking = state.speeds_mps[row], state.braking_capacity_mps2[row]
     behind = np.concatenate([[0.0], np.cumsum(state.gaps_m[row])])

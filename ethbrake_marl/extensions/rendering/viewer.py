@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -71,10 +73,9 @@ class Words(Viewer):
 
 
 def import_pygame(many: bool = False) -> Any:
-    """Import pygame from the package pygame-ce, which draws the window of one world.
+    """Import pygame of the package pygame-ce. Raises ``MissingExtra`` without it.
 
-    Raises ``MissingExtra`` if it is not installed, and ``InvalidInput`` if ``many`` (there is no window for many
-    worlds), or if the installed module is an old pygame-ce or belongs to the package pygame.
+    Raises ``InvalidInput`` for ``many`` worlds, which have no window, for an old pygame-ce, and for the package pygame.
     """
     if many:
         raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
@@ -92,10 +93,33 @@ def import_pygame(many: bool = False) -> Any:
     return pygame
 
 
+def start_display(many: bool = False) -> Any:
+    """Start the display, and return the module pygame.
+
+    Raises the errors of ``import_pygame``, and ``InvalidInput`` without a display.
+    """
+    pygame = import_pygame(many)
+    with _refusing(pygame):
+        pygame.display.init()
+        if pygame.display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
+            raise pygame.error("there is no display")  # SDL's last resort draws where nobody sees it
+    return pygame
+
+
+@contextmanager
+def _refusing(pygame: Any) -> Iterator[None]:
+    try:
+        yield
+    except pygame.error as error:
+        raise InvalidInput(
+            f"cannot open a window ({error}); render_mode = 'rgb_array' and film files need no display"
+        ) from None
+
+
 class Window(Viewer):
     """Viewer of the mode ``human``: a window that shows every step in real time. The user may close it."""
 
-    check = staticmethod(import_pygame)
+    check = staticmethod(start_display)
 
     def __init__(self, environment: Any) -> None:
         super().__init__(environment)
@@ -117,7 +141,7 @@ class Window(Viewer):
         """Do nothing: the window shows every step by itself."""
 
     def _play(self) -> None:
-        """Show the last time step in the window, in real time. Open the window first; stop if the user closes it."""
+        """Show the last time step in real time. Open the window first; stop if the user closes it."""
         for frame in [] if self.closed else self.step_frames():
             if self.window is None:
                 self.window = Screen(frame)
@@ -138,24 +162,17 @@ class Window(Viewer):
 class Screen:
     """A window of the size of a picture, [H, W, 3].
 
-    Raises ``MissingExtra`` and ``InvalidInput`` as ``import_pygame`` does, and ``InvalidInput`` without a display.
+    Raises the errors of ``start_display``.
     """
 
     def __init__(self, frame: Any) -> None:
-        self.pygame = import_pygame()
+        self.pygame = start_display()
         self.clock = self.pygame.time.Clock()
-        try:
-            self.pygame.display.init()
-            if self.pygame.display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
-                raise self.pygame.error("there is no display")  # SDL's last resort draws where nobody sees it
+        with _refusing(self.pygame):
             self.window = self.pygame.Window("EthBrake", frame.shape[1::-1])
-        except self.pygame.error as error:
-            raise InvalidInput(
-                f"cannot open a window ({error}); render_mode = 'rgb_array' and film files need no display"
-            ) from None
 
     def show(self, frame: Any, fps: int) -> bool:
-        """Show a picture for the time of one frame. Return whether the user has left the window open."""
+        """Show a picture for the time of one frame. Return whether the window is still open."""
         pygame = self.pygame
         picture = pygame.image.frombuffer(frame.tobytes(), frame.shape[1::-1], "RGB")
         self.window.get_surface().blit(picture, (0, 0))

@@ -33,29 +33,12 @@ class BestKnown(NamedTuple):
             cls(harm, columns.get(AVOIDABLE_COLUMN), columns.get(UNAVOIDABLE)) if HARM.keys() <= harm.keys() else None
         )
 
-    @property
-    def in_words(self) -> str:
-        """Sentences: mean best known harm, and share of the worlds in which no command avoids an impact."""
-        first, total = (float(self.harm[count].mean()) for count in HARM)
-        words = (
-            f"Mean best known harm of these worlds, where pushing is free: {first:.2f} first-impact, {total:.2f} total."
-        )
-        if "honest" in self.harm:
-            words += f" Mean best known honest cost: {self.harm['honest'].mean():.2f}."
-        if self.unavoidable is None:
-            return words
-        never = 100.0 * float(self.unavoidable.mean())
-        return f"In {never:.1f} % of the worlds, no command avoids an impact (proven). {words}"
-
     def regret(self, result: Result, agent: str, count: str) -> Floats:
         return np.asarray(result[agent][COLUMN[count]] - self.harm[count])
 
 
 def shown_counts(compared: Comparison) -> dict[str, str]:
-    """Counts to show, count -> column: first-impact harm, total harm, and the count that agents minimise.
-
-    The count that agents minimise is left out if the best known harm has been measured for other counts only.
-    """
+    """First-impact harm, total harm, and what agents minimise unless its best is not known: count -> column."""
     best_known, minimised = BestKnown.of(compared.result), compared.harm_count
     return (
         HARM if best_known is not None and minimised not in best_known.harm else {**HARM, minimised: COLUMN[minimised]}

@@ -31,11 +31,10 @@ MOST_SHOWN = 3  # agents that are shown at the start
 def player(
     compared: Comparison, focus: str, kinds: Mapping[int, str], records: Mapping[str, Sequence[EpisodeRecord]]
 ) -> Markup:
-    """Player of the episodes of all agents in some worlds, as HTML.
+    """Player of all agents' episodes in some worlds, as HTML; ``focus``, the first and the last agent are shown first.
 
-    At first the player shows at most three agents: ``focus`` (the agent that the page is about), the first and the
-    last. ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds,
-    sampled every ``MOTION_SAMPLE_S`` seconds.
+    ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, sampled
+    every ``MOTION_SAMPLE_S`` seconds.
     """
     result, agents, worlds = compared.result, list(records), list[dict[str, Any]]()
     for (row, kind), *episodes in zip(kinds.items(), *records.values(), strict=True):
@@ -82,10 +81,9 @@ def episode_data(record: EpisodeRecord) -> dict[str, Any]:
 def pieces_of(record: EpisodeRecord) -> Floats:
     """Motion in an episode as k pieces of constant acceleration, [k, 1 + 3 N].
 
-    Columns: the time at which a piece begins (s), position of Vehicle 1 (m), N - 1 gaps (m), N speeds (m/s), N
-    accelerations (m/s2). An impact between two samples ends a piece; the next piece begins at the impact and leads to
-    the second sample. If another event lies between the two samples, such as another impact, positions are wrong by
-    millimetres until the second sample.
+    Columns: time of the beginning (s), position of Vehicle 1 (m), N - 1 gaps (m), N speeds (m/s), N accelerations
+    (m/s2). An impact between two samples begins a piece. With another event between them, positions are wrong by
+    millimetres up to the second sample.
     """
     time_s, speeds, N = record.time_s, record.speeds_mps, record.speeds_mps.shape[1]
     rates = np.zeros_like(speeds)
@@ -103,10 +101,7 @@ def pieces_of(record: EpisodeRecord) -> Floats:
 
 
 def extrapolate(pieces: Floats, t: Floats, N: int) -> Floats:
-    """Positions, gaps, speeds and accelerations ``t`` [k] seconds after the beginning of k pieces of motion, [k, 3 N].
-
-    ``pieces``: as from ``pieces_of``, of N vehicles.
-    """
+    """Positions, gaps, speeds and accelerations ``t`` [k] seconds after k ``pieces`` of N vehicles begin, [k, 3 N]."""
     speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
     ways = (speeds + 0.5 * rates * t) * t
     gaps = pieces[:, 2 : 1 + N] + ways[:, :-1] - ways[:, 1:]
@@ -122,8 +117,7 @@ def _impacts(record: EpisodeRecord) -> list[list[float]]:
     """Impacts of an episode in order of time, seven numbers each.
 
     Time (s), pair from 0 (-1: Vehicle 1 and the obstacle), closing speed (m/s), whether it is the pair's first impact,
-    and the number of impacts, first-impact harm and total harm so far (m2/s2). The last harms are exactly those of the
-    episode.
+    and the number of impacts, first-impact harm and total harm so far (m2/s2).
     """
     rows, last = record.impacts, record.last
     number, first, total = np.cumsum(rows.number), np.cumsum(rows.first_impact_harm), np.cumsum(rows.total_harm)
@@ -141,7 +135,7 @@ TYPICAL = (0.5, 0.6, 0.7, 0.8, 0.9)  # quantiles of the harm
 
 
 def shown_worlds(compared: Comparison, focus: str) -> dict[int, str]:
-    """Worlds in which to show the agent ``focus``, at most ``MOST_WORLDS``: row of the result -> why it is shown."""
+    """Worlds in which to show the agent ``focus``: row of the result -> why it is shown."""
     result, column = compared.result, COLUMN[compared.harm_count]
     cost, best_known, chosen = result[focus][column], BestKnown.of(result), dict[int, str]()
 
@@ -164,10 +158,8 @@ def shown_worlds(compared: Comparison, focus: str) -> dict[int, str]:
 
 
 def worst_rows(compared: Comparison, focus: str) -> Ints:
-    """Rows of the worlds in which ``focus`` did worst, worst first, at most ten.
-
-    A world is worse if the count that agents minimise, minus its best known value if there is one, is larger. Worlds in
-    which this difference is not above 0 are left out.
+    """Rows of the worlds with the largest cost of ``focus`` above the best known one (above 0, if none is known), worst
+    first.
     """
     result, count, best_known = compared.result, compared.harm_count, BestKnown.of(compared.result)
     best = 0.0 if best_known is None else best_known.harm.get(count, 0.0)
@@ -181,10 +173,9 @@ def rows_by_value(value: Floats, among: Bools) -> Ints:
 
 
 def episodes_section(compared: Comparison, focus: str, kinds: dict[int, str]) -> Section:
-    """Section that plays back the worlds ``kinds`` (row -> why it is shown).
+    """Section that plays back the worlds ``kinds`` (row -> why it is shown), in which every team drives once more.
 
-    Every team drives these worlds again. A note names every agent whose harm now differs from its harm in the
-    evaluation. ``focus``: the agent that the page is about.
+    A note names every agent whose harm now differs from its harm in the evaluation.
     """
     rows, worlds, (_, game) = [*kinds], compared.worlds(kinds), open_game(compared.scenario)
     records = {agent: record_episodes(worlds, team, game, MOTION_SAMPLE_S) for agent, team in compared.teams.items()}

@@ -20,7 +20,7 @@ from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.evaluation.record import EpisodeRecord
+from ethbrake_marl.evaluation.record import EpisodeRecord, record_agents
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.evaluation.summary import caption, ranges_of
 from ethbrake_marl.extensions.rendering.picture import PALETTE, Frame, picture, vehicle_colour
@@ -55,10 +55,7 @@ EstimateCurve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by sid
 
 
 def curve_over_seeds(trainings: Sequence[Mapping[Any, float]]) -> EstimateCurve:
-    """Mean of several training runs, with an interval of one standard deviation over the seeds on both sides.
-
-    ``trainings``: for each run, step or progress -> recorded value. The curve has the steps that all runs share.
-    """
+    """Mean of several training runs, -+ one standard deviation over the seeds, at the steps that all share."""
     curve = {}
     for step in sorted(set.intersection(*map(set, trainings))):
         values = [training[step] for training in trainings]
@@ -78,9 +75,8 @@ def curves_figure(
 ) -> Figure:
     """Draw curves with their intervals as bands, one panel for each title.
 
-    ``panels``: title -> label of a curve -> curve; the legend shows the curves of the first panel, so it must have all
-    labels. ``lines``: title -> label -> value of a horizontal line. ``y_label``: label of a vertical axis that all
-    panels share; "": every panel has a vertical axis without a label.
+    ``panels``: title -> label of a curve -> curve; the first panel must have all labels. ``lines``: title -> label ->
+    value of a horizontal line. ``y_label``: label of a shared vertical axis; "": every panel has its own.
     """
     figure, all_axes = new_panels((5.0 * len(panels), 4.2), columns=len(panels), sharey=bool(y_label))
     labels = [*dict.fromkeys(label for curves in panels.values() for label in curves)]
@@ -111,10 +107,7 @@ BINS = 12  # groups of worlds with similar gaps
 
 @in_our_style
 def harm_by_agent(compared: Comparison, tests: Mapping[str, Comparison]) -> Figure:
-    """Draw the mean harm of each agent as a bar with its 95 % interval.
-
-    A vertical line shows the mean best known harm. Marks show the agents' means in other ``tests``, title -> results.
-    """
+    """Draw the mean harm of each agent with its 95 % interval, the best known mean, and marks for other ``tests``."""
     count, result, best_known = compared.harm_count, compared.result, BestKnown.of(compared.result)
     agents = list(result.columns)
     figure, (axes,) = new_panels((SLIM_IN, 0.9 + 0.24 * len(agents)))
@@ -141,10 +134,7 @@ def harm_by_agent(compared: Comparison, tests: Mapping[str, Comparison]) -> Figu
 
 @in_our_style
 def harm_above(compared: Comparison) -> Figure:
-    """Draw, for every x, the share of worlds in which an agent's regret (harm minus best known harm) is above x.
-
-    If no best known harm has been measured, harm takes the place of regret.
-    """
+    """Draw, for every x, the share of worlds with a regret above x; with a harm above x, if no best harm is known."""
     result, best_known, counts = compared.result, BestKnown.of(compared.result), shown_counts(compared)
     figure, panels = new_panels((10.0, 3.8), columns=len(counts), sharey=True)
     for axes, (count, harm) in zip(panels, counts.items(), strict=True):
@@ -165,11 +155,7 @@ def harm_above(compared: Comparison) -> Figure:
 
 
 def harm_against_total_gap(result: Result) -> Figure:
-    """Draw each agent's mean harm, with 95 % intervals, against the sum of the gaps at the alert.
-
-    Worlds are grouped by this sum, in ``BINS`` intervals of equal width. The panels show first-impact harm, total harm
-    and, if agents minimise it, the honest cost.
-    """
+    """Draw each agent's mean harm against the sum of the gaps at the alert, in ``BINS`` groups of equal width."""
     minimised = result.about.get("agent_settings", {}).get("harm_count", "first")
     counts = ({**HARM, minimised: COLUMN[minimised]}).items()
     names = [name for name in result.worlds if name.startswith("gap_")]
@@ -203,7 +189,7 @@ DECELERATION_POINTS = 2001  # evenly spaced decelerations
 def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float) -> Floats:
     """Harm in one world if vehicle ``body`` holds one of the C decelerations ``at`` (m/s2), [3, C] m2/s2.
 
-    Rows: first-impact harm predicted by the paper's closed form; simulated first-impact harm; simulated total harm.
+    Rows: predicted first-impact harm (closed form); simulated first-impact harm; simulated total harm.
     """
     braking, wait = np.ascontiguousarray(capacities(world.car, BRAKING)[0]), world.car[0, LATENCY].copy()
     priced: Any = harm_of_deceleration
@@ -217,10 +203,8 @@ def deceleration_figure(
 ) -> Figure:
     """Draw predicted and simulated harm in one world against the constant deceleration of the scenario's learner.
 
-    Marks show the decelerations that E-V2X-BM chooses, by the closed form and by simulation. ``best_known``: least
-    known harm in this world under any commands, ``first`` and ``total`` -> m2/s2, drawn as horizontal lines.
-
-    Raises ``InvalidInput`` unless there is exactly one world and one learner, and no script that looks at the state.
+    ``best_known``: least known harm in this world, ``first`` and ``total`` -> m2/s2. Raises ``InvalidInput`` unless
+    there are one world, one learner, and no script that looks at the state.
     """
     loaded, game = open_game(scenario)
     if world.n != 1 or len(loaded.learners) != 1 or game.scripts:
@@ -277,14 +261,20 @@ IMPACT: dict[str, Any] = {"marker": "X", "s": 60.0, "edgecolor": "black", "linew
 
 
 @in_our_style
-def trajectories(records: Mapping[str, EpisodeRecord]) -> Figure:
-    """Draw positions, gaps and commands in recorded episodes over time: one column for each episode, equal scales.
+def trajectories(
+    worlds: AnyScenario | State,
+    agents: Any = "full_brake,e_v2x_bm",
+    *,
+    scenario: AnyScenario | None = None,
+    number: int = 0,
+    seed: int = 7,
+    harm_count: str = "first",
+) -> Figure:
+    """Draw positions, gaps and commands of agents in one world over time: one column for each agent, equal scales.
 
-    ``records``: title -> episode. The caption states the quantities of the first episode's world. Raises
-    ``InvalidInput`` if there are no episodes.
+    ``agents`` as in ``evaluate``, the other arguments as in ``record_episode``.
     """
-    if not records:
-        raise InvalidInput("trajectories: there are no records; give at least one recorded episode")
+    records = record_agents(worlds, agents, scenario=scenario, number=number, seed=seed, harm_count=harm_count)
     first, columns = next(iter(records.values())), len(records)
     figure, panels = new_panels(
         (max(3.4 * columns, 6.4), 7.4), 3, columns, sharex=True, sharey="row", height_ratios=(2.2, 1.0, 1.0)
@@ -373,10 +363,7 @@ def write_worlds(path: Path, scenario: Scenario, episodes: int, *, seed: int, fo
 
 @in_our_style
 def worlds_figure(scenario: Scenario, drawn_worlds: DrawnWorlds, *, seed: int) -> Figure:
-    """Draw the distribution of each quantity that differs between worlds, and three worlds at the alert.
-
-    The three worlds have the smallest, the median and the largest sum of gaps.
-    """
+    """Draw the distributions of what differs between worlds, and three worlds: least, median, largest sum of gaps."""
     varying = _varying_quantities(drawn_worlds)
     columns = min(max(len(varying), 1), ABREAST)
     rows = -(-len(varying) // columns)
@@ -406,7 +393,6 @@ def _varying_quantities(drawn_worlds: DrawnWorlds) -> dict[Rule, dict[int, Float
 
 
 def _distribution(axes: Axes, rule: Rule, entries: dict[int, Floats]) -> None:
-    """Draw the distribution of a quantity. ``entries``: number of vehicle or pair, from 0 -> value in each world."""
     values = [column[~np.isnan(column)] for column in entries.values()]
     axes.hist(
         values,

@@ -1,7 +1,6 @@
-"""HTML pages, filled from the templates in this folder. A page is a single file, which loads no other file.
+"""HTML pages, filled from the templates in this folder. A page is one file, which loads no other.
 
-Texts are escaped: characters such as < are shown and never act as HTML. Control characters, and characters that change
-the writing direction, are shown as Python escapes.
+Texts are escaped. Control characters, and characters that change the writing direction, become Python escapes.
 """
 
 from __future__ import annotations
@@ -38,7 +37,6 @@ class Section(NamedTuple):
 
 
 def whole_page(title: str, lead: str, opening: Sequence[str], sections: Sequence[Section]) -> str:
-    """Complete HTML page. ``lead``: text below the title. ``opening``: parts above the table of contents."""
     style, script = (Markup("\n".join(map(read_file, names))) for names in (_STYLES, _SCRIPTS))
     values = {"title": title, "lead": lead, "opening": opening, "sections": sections, "style": style, "script": script}
     return str(fill("page.html.j2", **values))
@@ -55,10 +53,7 @@ def table(sheet: Sheet) -> Markup:
 
 
 def drawing(figure: Figure, title: str, description: str) -> Markup:
-    """HTML of a figure, with ``title`` and ``description`` for screen readers.
-
-    The caption is removed from the figure and becomes text of the page, so that it also fits a phone.
-    """
+    """HTML of a figure, whose caption becomes text of the page. ``title``, ``description``: for screen readers."""
     caption = " ".join(figure.get_supxlabel().split())
     figure.supxlabel("")
     svg = base64.b64encode(picture_bytes(figure, "figure.svg")).decode()
@@ -68,10 +63,7 @@ def drawing(figure: Figure, title: str, description: str) -> Markup:
 
 
 def data(name: str, content: object) -> Markup:
-    """``content`` as JSON for the page's scripts, in an HTML element with the id ``name``.
-
-    The characters < > and & are escaped, so the content cannot end the element or begin a new one.
-    """
+    """``content`` as JSON for the page's scripts, in an element with the id ``name``, which it cannot end."""
     text = json.dumps(content, allow_nan=False, separators=(",", ":"))
     for sign in "<>&":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
@@ -79,26 +71,17 @@ def data(name: str, content: object) -> Markup:
 
 
 def fill(file: str, **values: Any) -> Markup:
-    """HTML of the template ``file``, filled with values.
-
-    Values that are HTML (``Markup``) stay unchanged; all others are escaped.
-    """
+    """HTML of the template ``file``. Values that are HTML (``Markup``) stay; all others are escaped."""
     return Markup(_environment().get_template(file).render(values))
 
 
 def printable_text(value: object) -> str:
-    """``value`` as text. Control characters, and characters that change the writing direction, become Python escapes.
-
-    HTML (``Markup``) stays unchanged.
-    """
+    """``value`` as text without control characters and changes of direction. HTML (``Markup``) stays."""
     return value if isinstance(value, Markup) else plain_text(str(value), keep=_STAY)
 
 
 def breakable(name: str) -> Markup:
-    """HTML of a name that may break after ``:``, ``+``, ``@``, ``,`` and ``/``, such as ``e_v2x_bm:pairwise``.
-
-    HTML (``Markup``) stays unchanged.
-    """
+    """HTML of a name that may break after ``:``, ``+``, ``@``, ``,`` and ``/``. HTML (``Markup``) stays."""
     return name if isinstance(name, Markup) else Markup("<wbr>").join(map(printable_text, _AFTER_SIGN.split(name)))
 
 

@@ -20,11 +20,11 @@ from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.figures import harm_above, harm_by_agent
 from ethbrake_marl.extensions.report.page import Section, drawing, page_part, table, whole_page
-from ethbrake_marl.extensions.report.three_tests import SHORT_TABLE
 from ethbrake_marl.files.sheet import CellText, Column, Sheet
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Bools
 
+SHORT_TABLE = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of a short table, if they are shown
 LEARNED_AGENTS = ("trained policy", "trained team")  # names that get an article
 COUNTED_WORDS = {  # count -> verb, noun, and what is counted
     "first": ("does", " harm", "first impacts"),
@@ -34,11 +34,7 @@ COUNTED_WORDS = {  # count -> verb, noun, and what is counted
 
 
 def first_sentence(compared: Comparison, focus: str, tests: Mapping[str, Comparison]) -> str:
-    """First sentence of the page: the harm of the agent ``focus`` compared with full braking.
-
-    It also names the tests in which the agent does not do less harm than full braking. ``tests``: title of another test
-    -> its results with the same agents.
-    """
+    """First sentence of the page: ``focus`` against full braking; also the ``tests`` in which it is not better."""
     count, harm = compared.harm_count, COLUMN[compared.harm_count]
     rows, best_known = {row.agent: row for row in compared.table}, BestKnown.of(compared.result)
     row, before = rows[focus], rows.get(BASELINE)
@@ -71,10 +67,7 @@ def first_sentence(compared: Comparison, focus: str, tests: Mapping[str, Compari
 
 
 def change_of(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """Whether an agent does less or more harm than full braking. ``harm``: column of the harm.
-
-    "as much": the 95 % interval of the difference contains 0, or is unknown.
-    """
+    """Whether an agent does less harm than full braking; "as much": the interval contains 0, or is unknown."""
     difference = row[f"{harm}_difference"]
     if difference is None or (difference.interval is None and row.episodes > 1):
         return "as much"
@@ -194,10 +187,7 @@ def measure_parts(agents: SummaryTable) -> list[Markup]:
 
 
 def worst_section(compared: Comparison, focus: str, watched: Collection[int]) -> Section:
-    """Section with a table of the worlds in which ``focus`` did worst, at most ten.
-
-    ``watched``: rows of the worlds that the page can play back; these rows get a button that starts the player.
-    """
+    """Worlds in which ``focus`` did worst. The rows ``watched`` get a button that starts the player."""
     result, known_best, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
     counts = {**HARM, minimised: COLUMN[minimised]}
     columns = {IN_WORDS[count].capitalize(): result[focus][column] for count, column in counts.items()}
@@ -221,11 +211,7 @@ def worst_section(compared: Comparison, focus: str, watched: Collection[int]) ->
 
 
 def avoidable_section(compared: Comparison) -> Section:
-    """Section on regret (harm minus best known harm): a figure, and tables.
-
-    The tables divide the worlds by whether an impact is proven unavoidable. If no best known harm has been measured:
-    only a figure of the harm.
-    """
+    """Section on regret, or on harm if no best harm is known; by whether an impact is proven unavoidable."""
     result, best_known, figure = compared.result, BestKnown.of(compared.result), harm_above(compared)
     if best_known is None:
         words = "For each harm x: share of the worlds in which an agent did more harm than x."
@@ -245,10 +231,7 @@ def avoidable_section(compared: Comparison) -> Section:
 
 
 def _harm_among(compared: Comparison, best_known: BestKnown, where: str, among: Bools) -> Sheet:
-    """Table of each agent's collision rate, harm and regret in the worlds of the mask ``among`` [n].
-
-    ``where``: description of these worlds, for the title.
-    """
+    """Table of each agent's collision rate, harm and regret in the worlds of the mask ``among`` [n]."""
     result, counts = compared.result, shown_counts(compared)
     some, rows = result.take(among), []
     for agent, harm_columns in some.columns.items():

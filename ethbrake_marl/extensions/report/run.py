@@ -1,54 +1,52 @@
-"""Report of a training run: learning curves, the three tests, several learners, and the paper's tables."""
+"""Report of a training run: learning curves, the three tests, and several learners."""
 
 from __future__ import annotations
 
 import time
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.evaluation.comparison import Comparison
-from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.results import write_results
 from ethbrake_marl.evaluation.statistics import difference, mean
 from ethbrake_marl.evaluation.summary import BASELINE, caption
 from ethbrake_marl.extensions.report.best_known import REPORT_MEASURES
 from ethbrake_marl.extensions.report.figures import curves_figure, harm_against_total_gap, trajectories
 from ethbrake_marl.extensions.report.page import Section, drawing, table
-from ethbrake_marl.extensions.report.paper_rows import (
-    HYBRID_TEST,
-    PAPER_NOTE,
-    RANDOM_TEST,
-    is_papers_test,
-    printed_sheet,
-)
-from ethbrake_marl.extensions.report.report import ReportPage, Test
-from ethbrake_marl.extensions.report.style import TITLES, write_picture
-from ethbrake_marl.extensions.report.three_tests import TESTS, other_tests, short_sheet, title_of
+from ethbrake_marl.extensions.report.report import SHORT_TABLE, ReportPage, Test
+from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.experiment import HYBRID, SHIELDED, TEAM, TEAM_BASELINES, Experiment, Tables, without
 from ethbrake_marl.training.run import RunFolder
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
+from ethbrake_marl.worlds.scenario import Scenario
 
 REPORT_FILE = "report.html"
+TESTS = {
+    "paper-random": "Main test: Vehicle 2 may drive, and there is no obstacle ahead of Vehicle 1. Neither first-impact"
+    " nor total harm includes pushing Vehicle 1; the honest cost does.",
+    "paper-random-brake-only": "Brake-only test: the same worlds, but Vehicle 2 may only brake and coast, so it cannot"
+    " push with its engine.",
+    "paper-random-obstacle": "Obstacle test: the same worlds with an obstacle 1.7 m beyond the place where Vehicle 1"
+    " stops by itself. An impact of Vehicle 1 with the obstacle is harm.",
+}
 
 
 class RunReport:
     measures: tuple[str, ...] = (*Tables.measures, *REPORT_MEASURES)
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
-        """Write the results in the other tests, the figures and the page to the run's folder.
-
-        Returns tables to print, and a text that says where the page is.
-        """
         compared, folder = experiment.compared, experiment.trained.directory
         single = experiment.learned != TEAM
         tests, stage_numbers = other_tests(compared.scenario) if single else [], count()
@@ -67,21 +65,36 @@ class RunReport:
             write_results(folder, test_results[test.name].table, name=f"results-{test.name}.json", force=True)
         learners = [] if single else learners_sheets(compared)
         begin("figures")
-        figures = write_figures(experiment)
+        figures = run_figures(experiment)
         begin("page and episodes")
         report_page(experiment, test_results, figures, learners).write(folder / REPORT_FILE, force=True)
         begin("")
-        more = " and the paper's rows" if is_papers_test(compared.scenario) else ""
-        return [
-            short_sheet(compared, test_results),
-            *learners,
-        ], f"report with all measures{more}: {folder / REPORT_FILE}"
+        return [short_sheet(compared), *learners], f"report with all measures: {folder / REPORT_FILE}"
 
 
-def write_figures(experiment: Experiment) -> list[Markup]:
-    """Draw the learning curve, harm against the total gap, and one episode. Write them as PNG; return them as HTML."""
+def other_tests(scenario: Scenario) -> list[Scenario]:
+    """The other two of the three shipped tests. Empty unless ``scenario`` is one of the three, unchanged."""
+    tests = {name: load_scenario(name) for name in TESTS}
+    shipped = tests.pop(scenario.name, None)
+    if shipped is None or shipped.content(without=DESCRIPTIVE_KEYS) != scenario.content(without=DESCRIPTIVE_KEYS):
+        return []
+    return [*tests.values()]
+
+
+def title_of(name: str) -> str:
+    return TESTS[name].partition(":")[0]
+
+
+def short_sheet(compared: Comparison) -> Sheet:
+    """Table of the agents for a terminal, with the columns of ``SHORT_TABLE``."""
+    sheet = compared.table.terminal()
+    return replace(sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or name in SHORT_TABLE), keep=None)
+
+
+def run_figures(experiment: Experiment) -> list[Markup]:
+    """Learning curve, harm against the total gap, and one episode, as HTML."""
     compared, learned, trained = experiment.compared, experiment.learned, experiment.trained
-    training, recipe, (_, game) = trained.training, trained.training.recipe, open_game(compared.scenario)
+    training, recipe = trained.training, trained.training.recipe
     typical_row = typical_row_of(compared, learned)
     world, number = compared.worlds([typical_row]), int(compared.result.worlds["world"][typical_row])
     plan = recipe.evaluation
@@ -96,8 +109,8 @@ def write_figures(experiment: Experiment) -> list[Markup]:
         references = [row for row in compared.table if row.agent in TEAM_BASELINES]
         course += f" Horizontal lines: {caption(compared.table.parameters)}."
     beside = [agent for agent in compared.teams if agent in (*TEAM_BASELINES, learned)]
-    figures = {
-        "learning_curve.png": (
+    figures = [
+        (
             "Learning curve",
             "Harm and collisions on a fixed list of worlds during the training.",
             curves_figure(
@@ -113,28 +126,23 @@ def write_figures(experiment: Experiment) -> list[Markup]:
                 },
             ),
         ),
-        "harm_against_gap.png": (
+        (
             "Harm against the total initial gap",
             "Mean harm of each agent in worlds grouped by the sum of their gaps at the alert.",
             harm_against_total_gap(compared.result),
         ),
-        "trajectories.png": (
+        (
             "One episode",
             f"World {number} of the list, driven by these agents. It is a typical world: among the worlds in which full"
             f" braking collides, the harm that the {learned} avoids is the median here.",
-            trajectories({agent: record_episode(world, compared.teams[agent], game) for agent in beside}),
+            trajectories(world, {agent: compared.teams[agent] for agent in beside}, scenario=compared.scenario),
         ),
-    }  # fmt: skip
-    for name, (_, _, figure) in figures.items():
-        write_picture(trained.directory / name, figure, force=True)
-    return [drawing(figure, title, description) for title, description, figure in figures.values()]
+    ]  # fmt: skip
+    return [drawing(figure, title, description) for title, description, figure in figures]
 
 
 def typical_row_of(compared: Comparison, learned: str) -> int:
-    """Row of a typical world: of the worlds in which full braking does harm, the one with the median saving of harm.
-
-    The saving is that of the agent ``learned``. Row 0 if full braking does no harm.
-    """
+    """Row with the median saving of harm among the worlds in which full braking does harm; 0 if there are none."""
     harm = COLUMN[compared.harm_count]
     before = compared.result[BASELINE][harm]
     rows = np.flatnonzero(before > 0.0)
@@ -147,11 +155,7 @@ def typical_row_of(compared: Comparison, learned: str) -> int:
 def report_page(
     experiment: Experiment, test_results: Mapping[str, Comparison], figures: Sequence[Markup], learners: Sequence[Sheet]
 ) -> ReportPage:
-    """Page about a training run: settings, the compared agents, the paper's rows (in its own test), and other tests.
-
-    ``test_results``: name of another test -> its results. ``figures``: HTML of the figures. ``learners``: tables about
-    several learners.
-    """
+    """Page about a training run: settings, the compared agents, and other tests."""
     trained, compared, learned = experiment.trained, experiment.compared, experiment.learned
     training, recipe, name = trained.training, trained.training.recipe, compared.scenario.name
     steps = next(iter(trained.policies.values())).manifest.steps
@@ -180,10 +184,6 @@ def report_page(
         summary += f" The agent “{HYBRID}” is the trained policy with the paper's shield."
     if test_results:
         summary += f" {TESTS[name]} The results of the other two tests are further below."
-    sections = [Section("Several learners", [table(sheet) for sheet in learners])]
-    if is_papers_test(compared.scenario):
-        printed = [table(printed_sheet(rows)) for rows in (RANDOM_TEST, HYBRID_TEST)]
-        sections.append(Section("The paper's rows", [*printed, PAPER_NOTE], folded=True))
     stopped = f"The training was interrupted. This is the {learned} after {steps:,} steps."
     return ReportPage(
         f"ethbrake run: {name}",
@@ -191,7 +191,7 @@ def report_page(
         summary,
         {key: value for key, value in facts.items() if value},
         focus=learned,
-        sections=sections,
+        sections=[Section("Several learners", [table(sheet) for sheet in learners])],
         figures=figures,
         tests={title_of(test): Test(TESTS[test], comparison) for test, comparison in test_results.items()},
         remarks=[stopped] if trained.status == "interrupted" else (),
@@ -207,7 +207,6 @@ def _counts(compared: Comparison) -> list[str]:
 
 
 def _borne_sheet(compared: Comparison, count: str) -> Sheet:
-    """Table of the mean harm that each vehicle and the whole line bear under each agent. ``count``: count of harm."""
     scenario, by = compared.scenario, compared.result.clusters
     names = [name.replace("_", " ").capitalize() for name in scenario.vehicle_names]
     columns = [Column("Agent", "agent", text=True)]

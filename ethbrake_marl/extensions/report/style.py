@@ -82,10 +82,6 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
-    """Figure with ``rows`` times ``columns`` panels, and the axes of the panels, row by row.
-
-    ``size_in``: width and height in inches. ``how``: further arguments of matplotlib's ``subplots``.
-    """
     figure = new_figure(*size_in)
     return figure, list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
 
@@ -97,10 +93,7 @@ def series_style(number: int) -> dict[str, Any]:
 
 
 def label_text(text: str, most: int = 40) -> str:
-    """``text`` as a label of at most ``most`` characters; a longer text is cut in the middle.
-
-    A dollar sign does not start a formula, and characters that the font lacks are escaped.
-    """
+    """``text`` as a label, cut in the middle. A dollar sign starts no formula; unknown characters are escaped."""
     signs = font_signs()
     label = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
     return (label if len(label) <= most else f"{label[: most - 16]}…{label[-15:]}").replace("$", r"\$")
@@ -118,7 +111,7 @@ def band(axes: Axes, x: Sequence[float] | Floats, low: Any, high: Any, style: Ma
 def finish(
     figure: Figure, caption: str, legend: Axes | None = None, *, columns: int = 6, fontsize: float = 9
 ) -> Figure:
-    """Add a caption to a figure, and return the figure. ``legend``: panel whose legend is put above all panels."""
+    """Figure with a caption, and the legend of the panel ``legend`` above all panels."""
     if legend is not None:
         named = legend.get_legend_handles_labels()
         figure.legend(*named, loc="outside upper left", ncols=columns, frameon=False, fontsize=fontsize)
@@ -129,9 +122,8 @@ def finish(
 
 @in_our_style
 def picture_bytes(figure: Figure, path: str | Path) -> bytes:
-    """Content of a PNG, SVG or PDF file; the ending of ``path`` selects the format. No file is written.
-
-    The same figure always gives the same bytes. Raises ``InvalidInput`` for any other ending.
+    """Content of a PNG, SVG or PDF file; the ending of ``path`` selects the format. The same figure gives the same
+    bytes.
     """
     ending = Path(path).suffix.lower()
     if ending not in _NO_DATES:
@@ -142,16 +134,16 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
 
 
 def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
-    """Write ``figure`` to a PNG, SVG or PDF file; the ending of ``path`` selects the format.
+    """Write ``figure`` to a PNG, SVG or PDF file. If writing fails, an existing file stays.
 
-    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` for any other ending or if the file
-    cannot be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
+    Raises ``InvalidInput`` for any other ending or if the file cannot be written, and ``AlreadyExists`` if the file
+    exists and ``force`` is false.
     """
     write_output(path, picture_bytes(figure, path), force=force)
 
 
 def plain_number(value: float, _: int) -> str:
-    """Number on an axis as text such as 1000, not as a power of ten. The second argument, a position, is unused."""
+    """Number on an axis as text such as 1000, not as a power of ten."""
     return f"{value:g}"
 
 

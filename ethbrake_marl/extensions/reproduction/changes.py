@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST
 from ethbrake_marl.extensions.reproduction.curves import DISTANCE, DISTANCE_WORLDS, by_distance, harm_of_strategies
 from ethbrake_marl.extensions.reproduction.made import DRIVERS, Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.paper_rows import HYBRID_TEST
 from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, NON_E, ROUNDING, SHIPPED_SPECS, RandomOutcome
 from ethbrake_marl.extensions.reproduction.readings import STATED
 from ethbrake_marl.extensions.reproduction.strategies import (

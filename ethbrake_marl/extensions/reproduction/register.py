@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.reproduction.made import DRIVERS, Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.reproduction.random_test import PAPER_ROWS, RandomTable, table_of
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.verdicts import PERCENT

@@ -8,10 +8,10 @@ from typing import get_args
 import numpy as np
 
 from ethbrake_marl.evaluation.statistics import decrease, mean, rate, unpaired_difference
-from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, PaperRow
 from ethbrake_marl.extensions.reproduction.learning import RANDOM, courses_of, judge_trained, unconverged_policy
 from ethbrake_marl.extensions.reproduction.made import DRIVERS, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.map_bound import collides_in_map
+from ethbrake_marl.extensions.reproduction.paper_rows import HYBRID_TEST, RANDOM_TEST, PaperRow
 from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,
     NON_E,

@@ -8,9 +8,8 @@ from functools import cache
 import numpy as np
 from matplotlib.figure import Figure
 
-from ethbrake_marl.agent_names import open_game, teams_of
 from ethbrake_marl.evaluation.evaluate import SEED
-from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
+from ethbrake_marl.evaluation.record import EpisodeRecord, record_agents
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style
 from ethbrake_marl.extensions.reproduction.learning import RANDOM, courses_of, process
 from ethbrake_marl.extensions.reproduction.made import DRIVERS, DrawnFigure, Made, ReproductionSettings
@@ -33,10 +32,9 @@ Records = Mapping[tuple[str, int], EpisodeRecord]  # (PPO or SAC, number of the 
 def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Records:
     records = {}
     for number in PAPER_SCENARIOS:
-        scenario, game = open_game(reading.only("acts_s", "rear_s").scenario(f"paper-scenario-{number}"))
-        world = scenario.sample(1, SEED)
-        for name, team in teams_of(dict(policies), scenario).items():
-            records[name, number] = record_episode(world, team, game)
+        scenario = reading.only("acts_s", "rear_s").scenario(f"paper-scenario-{number}")
+        for name, record in record_agents(scenario, dict(policies), seed=SEED).items():
+            records[name, number] = record
     return records
 
 

@@ -39,9 +39,9 @@ class SearchMemory(NamedTuple):
 
 
 class Planner(Predicting):
-    """Agent that chooses all its commands at the alert. It assumes that other learners brake fully.
+    """Agent that chooses all its commands at the alert, as if other learners braked fully.
 
-    If the other learners do so, the harm that happens is the memory's ``predicted_harm``, to the last bit.
+    If they do, the harm that happens is the memory's ``predicted_harm``, to the last bit.
     """
 
     knows = MODEL
@@ -71,9 +71,8 @@ class Planner(Predicting):
 class BestHarm(Planner):
     """Agent that drives the best known commands: from a shipped table, or from a search.
 
-    A search begins with the choice of E-V2X-BM. If the agent is the only learner, the search's result is
-    compared with the commands of a shipped policy. The better one is improved once more, so the agent never does more
-    harm than that policy.
+    If it is the only learner, it never does more harm than E-V2X-BM and a shipped policy, whose commands are improved
+    once more.
     """
 
     def __init__(
@@ -83,9 +82,7 @@ class BestHarm(Planner):
         self.budget = budget
 
     def check(self, game: Game, body: int) -> None:
-        """Warn (``Unfamiliar``) if the scenario's table was made for other physics, so that every world must be
-        searched.
-        """
+        """Warn (``Unfamiliar``) if the scenario's table was made for other physics and is not used."""
         outdated = outdated_tables()
         if game.name in outdated:
             warnings.warn(f"{self.name}: searches every world: {outdated[game.name]}", Unfamiliar, stacklevel=2)
@@ -118,10 +115,7 @@ class BestHarm(Planner):
 
 
 class SearchAround(Planner):
-    """Agent that improves another agent's commands by a search at the alert.
-
-    It never does more harm than that agent, if the other vehicles keep their commands.
-    """
+    """Agent that improves another agent's commands by a search at the alert, so it never does more harm."""
 
     def __init__(
         self, inner: Agent, scenario: Scenario, count: str = "first", candidates: int = SEARCH_CANDIDATES
@@ -142,7 +136,7 @@ class SearchAround(Planner):
 def single_learner_game(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
     """Game whose only learner is vehicle ``body``, and its worlds at the alert, in which other learners brake fully.
 
-    Raises ``InvalidInput`` if the role of another vehicle is an agent whose commands are not known at the alert.
+    Raises ``InvalidInput`` if another vehicle's commands are not known at the alert.
     """
     for vehicle, role in enumerate(scenario.roles.values(), 1):
         if vehicle != body and role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):

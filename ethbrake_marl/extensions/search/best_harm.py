@@ -50,15 +50,13 @@ def best_harm(
     Args:
         game: game of the worlds' scenario.
         alert: worlds at the alert.
-        counts: counts of harm to search, one after the other (``episode.counts``). A profile found for one count is
-            also tried for the others.
+        counts: counts of harm to search (``episode.counts``); each also tries the profiles of those before.
         bodies: vehicles that are controlled (1: Vehicle 1); None: the learners.
         budget: number of profiles that are simulated in each world, for each count.
         seed: seed of the random search.
         threads: number of threads; None: the environment variable ``ETHBRAKE_THREADS``, or 1.
         first_profiles: profiles that are tried first, [n] each, with any number of phases.
-        objective: what is minimised, in each count, as in a scenario's key ``objective``; ``total``: the harm of the
-            line. The table holds the values of this objective.
+        objective: what is minimised, as in a scenario's key ``objective``; ``total``: the harm of the line.
 
     Raises ``InvalidInput`` for other counts, bodies or objectives, for a budget below 1 and for physics without exact
     impacts.
@@ -143,7 +141,7 @@ def search_list(
         threads: as for ``best_harm``.
         options: other arguments of ``best_harm``.
 
-    Raises ``InvalidInput`` if ``known_table`` contains none of the worlds, and the errors of ``best_harm``.
+    Raises the errors of ``best_harm``, and ``InvalidInput`` if ``known_table`` contains none of the worlds.
 
     """
     parts = []
@@ -178,10 +176,7 @@ def search_list(
 
 
 def agent_commands(problem: Problem, game: Game, alert: State, team: Team) -> Floats:
-    """Commands of a team that drives the worlds, at all T decisions of ``problem``, [n, T, B] m/s2.
-
-    After the end of the episodes, the last commands are repeated.
-    """
+    """Commands of a team at all T decisions of ``problem``, [n, T, B] m/s2; at the end the last repeat."""
     bodies, states = sorted(team.drivers), play(game, alert, team)
     next(states)
     commands = np.stack([state.wanted[:, bodies] for _, state in states], axis=1)
@@ -189,6 +184,6 @@ def agent_commands(problem: Problem, game: Game, alert: State, team: Team) -> Fl
 
 
 def driven_profiles(problem: Problem, game: Game, alert: State, team: Team) -> Profiles:
-    """Commands of a team that drives the worlds, as profiles with one phase for each change of command."""
+    """Commands of a team, as profiles with one phase for each change of command."""
     steps = Profiles.of_steps(agent_commands(problem, game, alert, team), problem.last_step)
     return Profiles.join([compact(*profile) for profile in zip(*steps, strict=True)])

@@ -1,8 +1,7 @@
 """Profiles of full driving and full braking, with which a search begins, because random profiles seldom contain them.
 
-The proof of the lower bound (``extensions.proofs``) shows that the best commands have one of two forms: drive fully,
-brake fully until the vehicle meets the one ahead, and drive fully again; or brake fully, drive fully until the vehicle
-behind meets it, and brake fully again.
+The best commands have one of two forms (``extensions.proofs``): drive fully, brake fully until the vehicle meets the
+one ahead, and drive fully again; or brake fully, drive fully until the vehicle behind meets it, and brake fully again.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ WAYS = ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5))  # (`early`, `share`) in `write_
 
 
 def extreme_profiles(problem: Problem) -> Profiles:
-    """The ``KEPT_PROFILES`` best profiles that only drive or brake fully, for one controlled vehicle, [n *
-    KEPT_PROFILES], world by world.
+    """The ``KEPT_PROFILES`` best profiles that only drive or brake fully, for one vehicle, [n * KEPT_PROFILES], world
+    by world.
 
-    The time of the first change of command is searched on a grid that is refined around the best. The second change is
-    when the vehicle meets its neighbour, predicted as if neighbours braked fully. In worlds without neighbours, or with
-    a vehicle that moves backward, the profiles coast.
+    The first change of command is searched on a grid that is refined around the best. The second is when the vehicle
+    meets its neighbour, predicted as if neighbours braked fully. Without neighbours, or moving backward, the profiles
+    coast.
     """
     (body,), n, last = problem.bodies.tolist(), problem.n, problem.last_step
     at, random = rows_of(problem.state, body), random_states(problem.identity, 0)
@@ -61,13 +60,13 @@ def extreme_profiles(problem: Problem) -> Profiles:
 
 @large
 def write_extreme(kind, change, meeting, early, share, step, last, low, high, ends, commands):
-    """Write a profile of full driving and full braking to ``ends`` [5] and ``commands`` [5, 1].
+    """Write a profile of full driving (``high``, m/s2) and full braking (``low``) to ``ends`` [5] and ``commands`` [5,
+    1].
 
     ``kind`` 0: drive, brake, drive; 1: brake, drive, brake. The first change is at ``change`` (s after the first
-    decision). In its step, of ``step`` s, the command is the mean over the step, so the speed after the step is exact.
-    The second change is ``early`` steps before the step of ``meeting`` (s; infinite: never). In its step the command is
-    ``share`` times the last command plus 1 - ``share`` times the second. ``last``: last step. ``low``, ``high``: full
-    braking and full driving (m/s2).
+    decision); in its step, of ``step`` s, the command is the mean, so the speed afterwards is exact. The second change
+    is ``early`` steps before the step of ``meeting`` (s; infinite: never); in its step the command is ``share`` times
+    the last plus 1 - ``share`` times the second. ``last``: last step.
     """
     first, second = (high, low) if kind == 0 else (low, high)
     turn = int(min(change / step, float(last)))

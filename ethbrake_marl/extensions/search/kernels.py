@@ -75,10 +75,7 @@ class Field(NamedTuple):
 
 @kernel
 def search_value(world, line):
-    """What the search minimises (m2/s2), plus a little of another count of harm, which decides ties.
-
-    ``world``: a ``World``. ``line`` [LINE_ROWS, N + 1]: the state of its bodies, with the harm so far.
-    """
+    """What the search minimises (m2/s2), plus a little of another count of harm, which decides ties."""
     aim = world.numbers[AIM]
     return worth(line, world.shares, world.weights[0], aim) + OTHER_WEIGHT * amount_so_far(line, world.weights[1])
 
@@ -94,10 +91,10 @@ def copy_line(line, into):
 def follow(world, lines, ends, commands, phase, most):
     """Simulate a profile from ``phase`` on; return its value (m2/s2), and the number of phases until the end.
 
-    ``world`` is a ``World``. ``ends`` [K], ``commands`` [K, B]: the profile. Starts from ``lines[phase]`` and writes
-    the state after phase p to ``lines[p + 1]``. Ends when all vehicles are at rest, or the value reaches ``most``
-    (m2/s2). The number of phases is -1 if a check of the physics fails. Step by step (``STEPWISE``) the result has the
-    bits of the episode; phase by phase it is several times faster and rounds differently.
+    Starts from ``lines[phase]`` and writes the state after phase p to ``lines[p + 1]``. Ends when all vehicles are at
+    rest, or the value reaches ``most`` (m2/s2). The number of phases is -1 if a check of the physics fails. Step by
+    step (``STEPWISE``) the result has the bits of the episode; phase by phase it is several times faster and rounds
+    differently.
     """
     numbers, clock = world.numbers, world.clock
     value = search_value(world, lines[phase])
@@ -152,9 +149,8 @@ def limit_command(command, low, high):
 
 @large
 def draw_command(world, b):
-    """Random command (m/s2) of the vehicle ``bodies[b]`` of a ``World``.
-
-    Often it is full braking, full driving, 0, or the command of the vehicle ahead.
+    """Random command (m/s2) of the vehicle ``bodies[b]``: often full braking, full driving, 0, or that of the vehicle
+    ahead.
     """
     random, body, low, high = world.random, world.bodies[b], world.bounds[b, 0], world.bounds[b, 1]
     u = next_uniform(random)
@@ -173,9 +169,8 @@ def draw_command(world, b):
 def draw_profile(world, drawing, ends, commands):
     """Write a random profile to ``ends`` [K] and ``commands`` [K, B]; return its number of phases.
 
-    ``world`` is a ``World``, ``drawing`` [DRAWING] says how to draw. The kind PROFILE has six phases of random
-    commands, most of them short. The kind PLAN has three: often full braking, another command for a while, and full
-    braking.
+    ``drawing`` [DRAWING]: PROFILE has six phases of random commands, most of them short; PLAN has three: often full
+    braking, another command for a while, and full braking.
     """
     random, bounds, last = world.random, world.bounds, int(world.clock[LAST])
     if drawing[KIND] == PLAN:
@@ -202,7 +197,7 @@ def draw_profile(world, drawing, ends, commands):
 def draw_change(world, active, drawing, change):
     """Write a random change of one of the first ``active`` phases of a profile to ``change`` [CHANGE].
 
-    ``world`` is a ``World``, ``drawing`` [DRAWING] says how to draw. The logarithm of an added amount is uniform.
+    The logarithm of an added amount is uniform.
     """
     random, bounds = world.random, world.bounds
     if drawing[KIND] == PLAN:
@@ -279,9 +274,8 @@ def largest_place(values):
 def gather(world, room, ends, commands, phases, random_count, drawing, tolerance, field):
     """Fill ``field`` with the best of Q profiles and ``random_count`` random profiles; its places are not sorted.
 
-    ``ends`` [Q, K], ``commands`` [Q, K, B]: the Q profiles. ``phases`` [Q]: their numbers of phases, at most K (0:
-    empty place). Of profiles whose values differ by less than ``tolerance`` (m2/s2), only the first is kept. ``world``,
-    ``room``, ``field``: a ``World``, ``Room``, ``Field``. ``drawing``: as for ``draw_profile``.
+    ``ends`` [Q, K], ``commands`` [Q, K, B], ``phases`` [Q]: the profiles (0 phases: empty place). Of profiles whose
+    values differ by less than ``tolerance`` (m2/s2), only the first is kept.
     """
     worst, number = 0, ends.shape[0]
     begin = min(worst, number)  # 0, but no literal: numba would compile the physics again for it
@@ -311,12 +305,9 @@ def gather(world, room, ends, commands, phases, random_count, drawing, tolerance
 def improve(world, room, ends, commands, budget, drawing, least):
     """Improve a profile in place by random changes, at most ``budget``, until its value is at most ``least`` (m2/s2).
 
-    ``world``, ``room``: a ``World``, ``Room``. ``ends`` [K], ``commands`` [K, B]: the profile. ``drawing``: as for
-    ``draw_profile``. A change that helps is repeated with twice the amount. A change that leaves the profile as it was
-    costs no budget, unless ``drawing`` is of the kind ``PLAN``.
-
-    Returns the profile's value (m2/s2; infinite if it cannot be simulated), and its number of phases until the episode
-    ends.
+    A change that helps is repeated with twice the amount. A change that leaves the profile as it was costs no budget,
+    unless ``drawing`` is of the kind ``PLAN``. Returns the value (m2/s2; infinite if it cannot be simulated), and the
+    number of phases until the episode ends.
     """
     change, lines, trial_lines = room.change, room.lines, room.tried
     new_ends, new_commands = room.ends[: ends.shape[0]], room.commands[: ends.shape[0]]
@@ -351,10 +342,7 @@ def improve(world, room, ends, commands, budget, drawing, least):
 
 @large
 def try_all(world, room, ends, commands, values):
-    """Write the value (m2/s2) of each of Q profiles to ``values`` [Q]; infinite if a profile cannot be simulated.
-
-    ``world``, ``room``: a ``World``, ``Room``. ``ends`` [Q, K], ``commands`` [Q, K, B]: the profiles.
-    """
+    """Write the value (m2/s2) of each of Q profiles to ``values`` [Q]; infinite if a profile cannot be simulated."""
     begin = min(0, ends.shape[0])  # no literal, as in `gather`
     for q in range(ends.shape[0]):
         value, reached = follow(world, room.lines, ends[q], commands[q], begin, math.inf)

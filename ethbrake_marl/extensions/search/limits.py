@@ -16,9 +16,9 @@ from ethbrake_marl.registry import Part
 
 
 def least_known_values(game: Game, alert: State) -> dict[str, Floats]:
-    """Least known value of each count of harm in each world, count -> [n] m2/s2, from the shipped tables.
+    """Least known value of each count that is known in all worlds, count -> [n] m2/s2, from the shipped tables.
 
-    A count is included only if it is known in all worlds. Raises ``InvalidInput`` if no count is.
+    Raises ``InvalidInput`` if no count is.
     """
     problem = problem_of(game, alert)
     least_values = {count: stored(problem, count)[0] for count in COUNTS}

@@ -67,10 +67,9 @@ LARGEST = 2.0  # largest weighted harm of a vehicle
 
 
 class Profiles(NamedTuple):
-    """A profile (commands over time) for each of n worlds.
+    """Profiles of n worlds: in world k, ``commands_mps2[k, j]`` holds until decision ``ends[k, j]``.
 
-    In world k, ``commands_mps2[k, j]`` holds until decision ``ends[k, j]``. Phases that a profile does not need are
-    empty: they begin and end at the last step.
+    Phases that a profile does not need begin and end at the last step.
     """
 
     ends: Ints  # [n, K] number of the decision at which each phase ends
@@ -86,10 +85,7 @@ class Profiles(NamedTuple):
         return np.take_along_axis(self.commands_mps2, phase[:, :, np.newaxis], 1)
 
     def shorten(self) -> Profiles:
-        """Profiles with ``MOST_PHASES`` phases.
-
-        Of a longer profile only the commands at some decisions are kept. Each holds until the next of these decisions.
-        """
+        """Profiles with ``MOST_PHASES`` phases: the commands at some decisions, each held until the next."""
         ends, commands = Profiles.pad([self], MOST_PHASES)[0]
         fits = ends[:, MOST_PHASES - 1] == ends[:, -1]
         few = np.minimum(np.array([*FEW_ENDS, np.iinfo(np.int64).max]), ends[:, -1:])
@@ -99,16 +95,12 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def of_steps(commands_mps2: Floats, last_step: Ints) -> Profiles:
-        """Profiles with one phase for each of T decisions, from the commands [n, T, B] (m/s2) at these decisions.
-
-        ``last_step`` [n]: number of decisions before the horizon.
-        """
+        """Profiles with one phase for each of T decisions, from the commands [n, T, B] (m/s2). ``last_step`` [n]."""
         ends = np.minimum(np.arange(1, commands_mps2.shape[1] + 1), last_step[:, np.newaxis])
         return Profiles(ends, np.ascontiguousarray(commands_mps2))
 
     @staticmethod
     def pad(parts: Sequence[Profiles], least: int = 1) -> list[Profiles]:
-        """Add empty phases so that all parts have the same number of phases, at least ``least``."""
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [
             Profiles(
@@ -124,10 +116,7 @@ class Profiles(NamedTuple):
 
 
 def best_of(results: Sequence[tuple[Floats, Profiles]]) -> tuple[Floats, Profiles]:
-    """Least of several harms in each world, [n], and its profile, [n]; of equal harms the first.
-
-    ``results``: pairs of harms [n] and their profiles [n].
-    """
+    """Least of several harms in each world, [n], and its profile, [n]; of equal harms the first."""
     harms = np.stack([harm for harm, _ in results])
     pick, rows = harms.argmin(axis=0), np.arange(harms.shape[1])
     padded_profiles = Profiles.pad([profiles for _, profiles in results])
@@ -181,10 +170,10 @@ class Problem(NamedTuple):
         return np.minimum(low + share * (high - low), high)
 
     def constant(self, commands_mps2: Floats) -> Profiles:
-        """Profiles that hold one of Q commands to the end, [n * Q]: first the Q profiles of world 0, and so on.
+        """Profiles that hold one of Q commands [n, Q, B] to the end, [n * Q]: first the Q profiles of world 0, and so
+        on.
 
-        ``commands_mps2`` [n, Q, B]: the commands. A profile has several phases with the same command, which a search
-        can change one by one.
+        They have several phases with the same command, which a search can change one by one.
         """
         n, Q, B = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
@@ -196,10 +185,9 @@ class Problem(NamedTuple):
         return Profiles(self.last_step[:, np.newaxis].copy(), np.zeros((self.n, 1, len(self.bodies))))
 
     def follow(self, profiles: Profiles) -> State:
-        """Simulate the episodes in which the controlled vehicles follow ``profiles``; return their last states.
+        """Last states of episodes whose controlled vehicles follow ``profiles``, with the bits of such agents.
 
-        The states have the same bits as if agents gave these commands. Raises ``InvalidInput`` as ``check`` does, and
-        ``PhysicsError`` if a check of the physics fails.
+        Raises the errors of ``check``, and ``PhysicsError`` if a check of the physics fails.
         """
         self.check(profiles)
         line, car, clock, know, wanted, memories = self.state
@@ -215,10 +203,7 @@ class Problem(NamedTuple):
         return State(line, car, clock, know, wanted, memories)
 
     def value(self, last: State, count: str | None = None) -> Floats:
-        """What the search minimises, for episodes with the last states ``last``, [n] m2/s2.
-
-        ``count``: count of harm; None: the problem's.
-        """
+        """What the search minimises, for episodes with the last states ``last``, [n] m2/s2."""
         value, weights = np.empty(self.n), weights_of(self.harm_count if count is None else count)
         worths(last.line, self.shares, weights, self.aim, value)
         return value
@@ -229,10 +214,7 @@ class Problem(NamedTuple):
         return {count: self.value(last, count) for count in COUNTS}
 
     def with_weights(self, weights: Floats, *, largest: bool = False) -> Problem:
-        """Problem that minimises the sum of the vehicles' harm times ``weights`` [n, N].
-
-        ``largest``: the largest of these products instead.
-        """
+        """Problem of the sum (``largest``: the largest) of the vehicles' harms times ``weights`` [n, N]."""
         mass = self.state.car[:, MASS]
         weights = np.pad(np.broadcast_to(weights, (self.n, mass.shape[1] - 1)), ((0, 0), (1, 0)))
         front = mass[:, 1:] / (mass[:, :-1] + mass[:, 1:])  # 0 of the obstacle, whose mass is infinite
@@ -242,7 +224,6 @@ class Problem(NamedTuple):
         return self._replace(shares=shares, aim=LARGEST if largest else WEIGHTED)
 
     def check(self, profiles: Profiles) -> None:
-        """Raise ``InvalidInput`` for profiles of a wrong shape, wrong ends, or commands beyond a vehicle's capacity."""
         K, B = profiles.ends.shape[-1], len(self.bodies)
         if profiles.ends.shape != (self.n, K) or profiles.commands_mps2.shape != (self.n, K, B):
             raise InvalidInput(
@@ -273,11 +254,9 @@ def problem_of(
 ) -> Problem:
     """Problem of finding the best commands of some vehicles in worlds at the alert.
 
-    Learners that are not among ``bodies`` brake fully; all other vehicles hold the commands of their roles.
-
-    ``bodies``: controlled vehicles (1: Vehicle 1); None: the learners. ``count``: what is minimised
-    (``episode.counts``). ``objective``: whose harm counts, as in a scenario's key ``objective``. ``deciders``:
-    vehicles whose shortest latency is the time of the first decision; None: ``bodies``.
+    Learners that are not among ``bodies`` brake fully; all other vehicles hold the commands of their roles. ``bodies``:
+    controlled vehicles (1: Vehicle 1); None: the learners. ``objective``: whose harm counts, as in a scenario.
+    ``deciders``: vehicles whose shortest latency is the time of the first decision; None: ``bodies``.
 
     Raises ``InvalidInput`` for vehicles that do not exist, an unknown count, an objective that is not a weighted sum of
     harm or ``maximin``, and a script that observes the state, whose commands are not known at the alert.
@@ -305,7 +284,6 @@ def problem_of(
 
 
 def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
-    """Worlds at the alert in which the vehicles ``bodies`` brake fully, whatever their roles say."""
     wanted = alert.wanted.copy()
     wanted[:, bodies] = -capacities(alert.car, BRAKING)[:, bodies]
     return alert._replace(wanted=wanted)
@@ -314,9 +292,8 @@ def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
 def beside_braking(problem: Problem, single_problem: Problem, profiles: Profiles) -> Profiles:
     """Profiles for ``problem`` in which one vehicle follows ``profiles`` and the other controlled vehicles brake fully.
 
-    ``single_problem``: the problem of this vehicle alone in the same worlds; ``profiles`` are its solutions. Its first
-    decision may be later than the first one of ``problem``, because the vehicle's latency is longer. Times between two
-    decisions of ``problem`` are rounded to the nearest decision.
+    ``profiles`` solve ``single_problem``, the vehicle alone, whose first decision may be later. Times between two
+    decisions of ``problem`` are rounded to the nearest.
     """
     later = single_problem.state.clock[:, FIRST_DECISION] - problem.state.clock[:, FIRST_DECISION]
     last = problem.last_step[:, np.newaxis]
@@ -330,8 +307,7 @@ def beside_braking(problem: Problem, single_problem: Problem, profiles: Profiles
 def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
     """Hash of everything that decides the harm of a profile, [n]: 8 bytes of BLAKE2b of each world.
 
-    The hash covers the world, the controlled vehicles (``bodies``), the commands of all other vehicles, and ``times``
-    [n, 4]: first decision, time step, number of steps, end.
+    ``times`` [n, 4]: first decision, time step, number of steps, end.
     """
     line, car, digests = alert.line, alert.car, np.empty(alert.n, np.uint64)
     controlled = np.zeros(alert.wanted.shape)
@@ -355,10 +331,8 @@ def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
 
 
 def with_objective(problem: Problem, objective: Declared) -> Problem:
-    """Problem whose search minimises ``objective``, given as in a scenario's key ``objective``.
-
-    Raises ``InvalidInput`` if the controlled vehicles' objective is neither a weighted sum of harm nor ``maximin``, or
-    differs among them.
+    """Problem whose search minimises ``objective``, as in a scenario's key. Raises ``InvalidInput`` for other
+    objectives than ``problem_of``.
     """
     car, chosen = problem.state.car, [body - 1 for body in problem.bodies.tolist()]
     objectives = objectives_of(objective, problem.state.vehicles)
@@ -381,7 +355,6 @@ def worth(line, shares, weights, aim):
     """What a search minimises (m2/s2), in one world at one time. The value never decreases during an episode.
 
     ``line`` [LINE_ROWS, N + 1]: the state, with the harm so far. ``shares`` [3, N + 1], ``aim``: as in ``Problem``.
-    ``weights`` [6]: of the count of harm.
     """
     if aim == WHOLE_LINE:
         return amount_so_far(line, weights)
@@ -405,10 +378,9 @@ def worths(line, shares, weights, aim, out):
 
 @large
 def follow_worlds(line, car, clock, wanted, ends, commands, bodies, time_step_s, scratch, failed):
-    """Simulate every world's profile to the end, decision by decision; change ``line``, ``clock``, ``wanted`` in place.
+    """Simulate every world's profile to the end, decision by decision, in place.
 
-    ``line``, ``car``, ``clock``, ``wanted``: as in ``State``. ``ends``, ``commands``: as in ``Profiles``. ``failed``
-    [n] becomes True where a check of the physics failed.
+    ``failed`` [n] becomes True where a check of the physics failed.
     """
     for k in range(len(failed)):
         phase = 0

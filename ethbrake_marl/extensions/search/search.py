@@ -41,10 +41,10 @@ def search_profiles(
 ) -> tuple[Profiles, dict[str, Floats]]:
     """Search each world for the best profile; return the profiles, and what they cost, count -> [n] m2/s2.
 
-    The result is at least as good as all profiles of ``starts``. Each part of ``starts`` has Q profiles for each world,
-    [n * Q]: first the Q profiles of world 0, and so on. ``budget`` is about the number of profiles that are simulated
-    in each world. The result does not depend on the number of threads. Finally the best profile is polished: its
-    commands are changed at single decisions and, if one vehicle is controlled, also at several decisions at once.
+    The result is at least as good as all of ``starts``, each with Q profiles for each world, [n * Q]: first those of
+    world 0. ``budget``: about the number of profiles that are simulated in each world. The number of threads changes
+    nothing. Finally the commands of the best profile are changed at single decisions and, if one vehicle is controlled,
+    at several at once.
 
     Raises ``InvalidInput`` for an invalid budget, seed or number of threads, and ``PhysicsError`` for worlds in which
     no profile can be simulated.
@@ -94,10 +94,7 @@ def search_profiles(
 
 
 def join_profiles(parts: Sequence[Profiles], n: int) -> Profiles:
-    """Profiles of all ``parts``, arranged by world, [n, Q].
-
-    A part has q profiles for each of n worlds, [n * q]. q may differ between parts, but not the number of phases.
-    """
+    """Profiles of all ``parts`` ([n * q] each, of equally many phases), arranged by world, [n, Q]."""
     K, B = parts[0].commands_mps2.shape[1:]
     ends = np.concatenate([part.ends.reshape(n, -1, K) for part in parts], axis=1)
     return Profiles(ends, np.concatenate([part.commands_mps2.reshape(n, -1, K, B) for part in parts], axis=1))
@@ -106,12 +103,9 @@ def join_profiles(parts: Sequence[Profiles], n: int) -> Profiles:
 def search_world(world: World, room: Room, starts: Profiles, last: int, budget: int) -> Profiles | None:
     """Best profile of one world, [1]; None if no profile can be simulated.
 
-    ``starts``: profiles that are tried first. ``last``: number of decisions. ``budget``: number of profiles to
-    simulate.
-
-    First many profiles are improved in rounds. Each round keeps the better half. Then the phases of the best profile
-    are divided, and it is improved again. Finally it is improved with a step-by-step simulation, because rounding
-    decides how large harm is where harm jumps.
+    Many profiles are improved in rounds, each of which keeps the better half. Then the phases of the best profile are
+    divided, and it is improved again, at last with a step-by-step simulation, because rounding decides how large harm
+    is where harm jumps. ``last``: number of decisions. ``budget``: number of profiles to simulate.
     """
     K, B = room.commands.shape
     M, rounds = SMALLEST_FIELD, 3
@@ -149,10 +143,7 @@ def sort(field: Field, survivors: int) -> None:
 
 
 def compact(ends: Ints, commands: Floats) -> Profiles:
-    """One profile without empty phases, [1]. Neighbouring phases with equal commands are joined.
-
-    ``ends`` [K], ``commands`` [K, B] (m/s2): the profile.
-    """
+    """One profile without empty phases, [1]. Neighbouring phases with equal commands are joined."""
     there = np.diff(ends, prepend=0) > 0
     ends, commands = ends[there], commands[there]
     changes = (commands[1:] != commands[:-1]).any(axis=1)
@@ -160,9 +151,8 @@ def compact(ends: Ints, commands: Floats) -> Profiles:
 
 
 def halve_phases(field: Field, attention: int) -> None:
-    """Halve phases of the best profile in ``field`` until it has K phases, the most that ``field`` can hold.
-
-    The next phase to halve is the longest within the first ``attention`` steps.
+    """Halve the longest phases within the first ``attention`` steps of the best profile in ``field`` until it has K
+    phases.
     """
     phase_count, K = field.phases[0], field.ends.shape[1]
     if phase_count > 0 and field.values[0] > 0.0:
@@ -189,10 +179,9 @@ def refine(problem: Problem, commands_mps2: Floats, *, budget: int) -> tuple[Flo
     """Improve one vehicle's commands at T decisions; return the best, [n, T] m/s2, and their values, [n] m2/s2.
 
     The result is at least as good as ``commands_mps2`` [n, T]. Small changes may miss the best commands, so the best of
-    some random *templates* is improved as well. A template has one command, another for a while, then full braking.
-
-    Raises ``InvalidInput`` for several controlled vehicles, commands that do not fit, or a budget below 1, and
-    ``PhysicsError`` for worlds in which ``commands_mps2`` cannot be simulated.
+    some random *templates* (a command, another for a while, then full braking) is improved as well. Raises
+    ``InvalidInput`` for several controlled vehicles, commands that do not fit, or a budget below 1, and
+    ``PhysicsError`` for worlds that cannot be simulated.
     """
     check_whole_number("budget", budget, 1)
     if len(problem.bodies) != 1:
@@ -237,10 +226,7 @@ def field_for(profiles: int, phases: int, controlled: int) -> Field:
 
 
 def prepare_world(problem: Problem, k: int, random: UInt64s, phases: int, stepwise: bool) -> tuple[World, Room]:
-    """The compiled search's form of world ``k``, and working memory for profiles of up to ``phases`` phases.
-
-    ``random`` [n]: states of the random number generators. ``stepwise``: simulate decision by decision.
-    """
+    """The compiled search's form of world ``k``, and working memory for profiles of up to ``phases`` phases."""
     state = problem.state
     numbers = np.array([problem.time_step_s, problem.aim, stepwise])
     count = problem.harm_count

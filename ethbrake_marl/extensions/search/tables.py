@@ -44,7 +44,7 @@ class BestHarmTable:
 
     @classmethod
     def load(cls, path: Path) -> BestHarmTable:
-        """Read a table. Raises ``InvalidInput`` if there is no file, and ``CorruptBundle`` for a damaged one."""
+        """Read a table. Raises ``InvalidInput`` and ``CorruptBundle``."""
         if not path.exists():
             raise InvalidInput(f"{path}: there is no such file; give the file of a table of best known harm")
         data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
@@ -63,7 +63,7 @@ class BestHarmTable:
         return cls(arrays["identity"], harm, profiles, header)
 
     def save(self, path: Path) -> None:
-        """Write a compressed .npz file. If writing fails, an existing file stays unchanged."""
+        """Write a compressed .npz file, completely or not at all."""
         write_file(path, self.content())
 
     def content(self) -> bytes:
@@ -85,8 +85,7 @@ class BestHarmTable:
     def stored(self, problem: Problem, count: str) -> tuple[Floats, Profiles]:
         """Least known harm of the problem's worlds, [n] m2/s2, and the profiles that reach it, [n].
 
-        ``count``: count of harm (``episode.counts``). A world that is not in the table has infinite harm and a profile
-        that coasts.
+        A world that is not in the table has infinite harm and a profile that coasts.
         """
         rows = self.rows(problem.identity)
         in_table = rows >= 0
@@ -129,17 +128,13 @@ def outdated_tables() -> dict[str, str]:
 
 
 def best_stored(problem: Problem, count: str) -> tuple[Floats, Profiles]:
-    """Least harm of each world in the shipped tables, [n] m2/s2, and the profiles that reach it, [n].
-
-    ``count``: count of harm (``episode.counts``). A world that is in no table has infinite harm and coasts.
-    """
+    """As ``BestHarmTable.stored``, from all shipped tables."""
     results = [table.stored(problem, count) for table in shipped_tables()]
     nothing = np.full(problem.n, np.inf), problem.coasting()
     return best_of([result for result in results if np.isfinite(result[0]).any()] or [nothing])
 
 
 def _unpack_arrays(data: bytes) -> dict[str, NDArray[Any]]:
-    """Arrays in the content of a file, name -> array. Raises ``ValueError`` for a damaged or too large file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(member.file_size for member in archive.infolist())
@@ -152,7 +147,6 @@ def _unpack_arrays(data: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _check(arrays: Mapping[str, NDArray[Any]], counts: list[str]) -> None:
-    """Raise ``ValueError`` unless the arrays of a table have the right names, types, shapes and values."""
     expected_arrays = ARRAYS | {f"{count}_{name}": kind for count in counts for name, kind in OF_COUNT.items()}
     for name in sorted(expected_arrays.keys() ^ arrays.keys()):
         raise ValueError(f"array {name!r}: {'is missing' if name in expected_arrays else 'must not be in this file'}")

@@ -1,1 +1,1 @@
-"""Studies of many training runs or many worlds, and the command ``ethbrake study falsify``."""
+"""The folder of a study of many training runs, and the machine on which it ran."""

@@ -17,21 +17,11 @@ from ethbrake_marl.files.store import check_folder, hold_lock, remove_unfinished
 def work_in(
     folder: Path, kind: str, settings: Mapping[str, Any], *, record: str, advice: str, writes: Collection[str] = ()
 ) -> Iterator[None]:
-    """Context manager that creates a study's folder, and locks it against other processes.
+    """Create and lock a study's folder. The same command continues there after an interruption.
 
-    After an interruption, the same command continues the study in this folder; unfinished files of killed processes are
-    removed first.
-
-    Args:
-        folder: created if necessary.
-        kind: what the folder contains, in words for messages, such as ``an ablation``.
-        settings: all settings and software versions on which the results depend, as plain data.
-        record: name of the file that stores ``settings``.
-        advice: end of error messages, which says what the user can do.
-        writes: names of the files that the study will overwrite.
-
-    Raises ``InvalidInput`` if the folder is not writable or stores other settings, and if another process works in it.
-
+    ``kind`` and ``advice``: words for messages. ``settings``: all on which results depend, stored in the file
+    ``record``. ``writes``: files that the study overwrites. Raises ``InvalidInput`` for a folder that cannot be
+    written, has other settings, or is in use.
     """
     check_folder(folder, writes, force=True)
     folder.mkdir(parents=True, exist_ok=True)

@@ -36,6 +36,10 @@ def test_update__joins_the_decisions_of_all_lines_and_divides_their_returns() ->
     visited = model.collect(callback)
     assert [len(part.observations) for part in visited] == [4 * 6, 4 * 2 * 2]
     assert [part.states.vehicles for part in visited] == [3, 5] and model.num_timesteps == 4 * 10
+    for part, scenario, bodies in zip(visited, (PAPER, FIVE), ([2], [3, 4]), strict=True):
+        _, game = eb.open_game(scenario, observation=SEEN)
+        seen = np.stack(game.observe(part.states, np.array(bodies)), axis=1)
+        np.testing.assert_array_equal(part.observations, seen.reshape(part.observations.shape))
     for part in visited:
         torch.manual_seed(5)
         relative = model.try_out(part).gradient
@@ -47,6 +51,16 @@ def test_update__joins_the_decisions_of_all_lines_and_divides_their_returns() ->
     model.train_actor = lesson.append
     model.improve(visited)
     assert len(lesson[0].seen) == len(lesson[0].gradient) == 12 + 4
+
+
+def test_cost__of_each_line_is_what_full_braking_costs_in_its_part_of_the_list() -> None:
+    costs = [line.cost for line in new_model(MIXING, LINES).lines]
+    parts = ((PAPER, 8), (FIVE, 2))  # of the 10 worlds of the fixed list, by the weights 3 and 1
+    right = [
+        eb.evaluate(scenario, "full_brake", episodes=n, harm_count="honest")["full_brake"]["honest_cost"].mean()
+        for scenario, n in parts
+    ]
+    assert costs == pytest.approx(right) and costs[0] != pytest.approx(costs[1])
 
 
 def begin(run: Path, **settings: Any) -> Any:
@@ -133,7 +147,8 @@ def test_network__begins_as_a_policy_in_its_range_and_as_a_feature_elsewhere() -
 def test_training__starts_from_a_policy_and_a_feature(tmp_path: Path) -> None:
     still = MIXING.replace(
         start="ppo", observation=["own", "front_1", "rear_1", "role", "obstacle", "plan"], total_steps=1,
-        network={"policy": [190, 135, 8], "initial_action": "plan.action"}, learning_rate={"start": 1e-12, "end": 1e-12},
+        network={"policy": [190, 135, 8], "initial_action": "plan.action"},
+        learning_rate={"start": 1e-12, "end": 1e-12},
     )  # fmt: skip
     policy = train(still, LINES, tmp_path / "run", measure=None, on_progress=None).policy
     agents = {"ppo": "ppo", "plan": "plan", "policy": eb.LearnedAgent(policy)}

@@ -53,6 +53,7 @@ def _registered() -> None:
         "more": UsersKey("more", Faster("more", 2.0, 1.0)),
         "twice": UsersKey("twice", Faster("twice", 0.0, 2.0)),
         "early_twice": UsersKey("early", Faster("early", 0.0, 2.0, stage=-1)),
+        "late": UsersKey("late", Faster("late", 2.0, 1.0, stage=2)),
         "news": UsersKey("messages", Mine()),
     }
     for key, extension in extensions.items():
@@ -121,6 +122,8 @@ def test_keys__of_all_extensions_act_together(v2x: dict[str, Any], infos: list[s
         ({"more": 1, "early_twice": 1}, 42.0),  # 20 * 2 + 2: the lower stage first
         ({"more": 1, "twice": 1, "persistence": "first"}, 44.0),  # messages report what was measured
         ({"more": 1, "twice": 1, "persistence": "periodic"}, 44.0),
+        ({"late": 1, "twice": 1, "persistence": "first"}, 42.0),  # a layer behind the messages
+        ({"late": 1, "twice": 1, "persistence": "periodic"}, 42.0),
     ],
     ids=str,
 )
@@ -137,6 +140,10 @@ def test_layers__compose_in_the_order_of_their_stages_each_with_its_memory(
         state, _ = game.step(state, np.zeros((2, 1)))
     assert game.seen(state, 2).speeds_mps[:, 0] == pytest.approx(seen_mps)
     assert state.speeds_mps[:, 0] == pytest.approx(20.0)
+    own = state.line.copy()
+    own[:, SPEED, 1:] = seen_mps
+    right = game.views[2].observe(state._replace(line=own), np.array([2]), scenario.time_step_s)[:, 0]
+    assert game.observe_alike(state, [2])[:, 0] == pytest.approx(right)
     for layer in game.layers:
         if isinstance(layer, Faster):
             assert state.memories[layer.name].tolist() == [3.0, 3.0]

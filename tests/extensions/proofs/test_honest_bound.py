@@ -1,21 +1,29 @@
-"""The proven bound on the honest cost: each lemma against a separate simulator, and no plan below the bound."""
+"""The proven bound on the honest cost: pieces by hand, and no episode costs less than a box that contains its chain."""
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
-import numba
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.step import hold_commands
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.record import advance_worlds
 from ethbrake_marl.extensions.proofs import line as row
-from ethbrake_marl.extensions.proofs.avoidability import FRONT, REASON, VERDICT, decide
-from ethbrake_marl.extensions.proofs.chain_search import chain_bound, triple_contact
+from ethbrake_marl.extensions.proofs.avoidability import FRONT, avoidability
+from ethbrake_marl.extensions.proofs.chain_search import triple_contact
 from ethbrake_marl.extensions.proofs.chains import (
     BOX_ROWS,
+    EARLY,
+    HARD,
+    MOST_PUSH,
+    PUSH,
+    SINCE,
+    SOFT,
+    SOFT_2,
+    UNTIL,
     chain_cost,
     cruise,
     most_push,
@@ -24,221 +32,158 @@ from ethbrake_marl.extensions.proofs.chains import (
     third_at_rear,
     third_cost,
 )
-from ethbrake_marl.extensions.proofs.lower_bound import last_rest, lower_bound
+from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, REAR_FIRST
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.search.pricing import with_braking
 from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable
-from ethbrake_marl.motion.impact import TOUCH_MPS
-from ethbrake_marl.motion.layout import LATENCY, LIMIT, MASS, PASSED, PUSHED, TOTAL, scratch_for
-from tests.extensions.proofs.worlds import wide_worlds, worlds as three
-from tests.reference import three_vehicles as sim
+from ethbrake_marl.motion.impact import PLASTIC_MPS, TOUCH_MPS
+from ethbrake_marl.motion.layout import FIRST, GAP, HIT, PUSHED, SPEED, Floats, scratch_for
+from tests.extensions.proofs.worlds import at, worlds as three
 
-STEP_S, HORIZON_S = 0.1, 14.0
-
-
-def random_worlds(n, rng):
-    """Worlds of three vehicles at the moment at which the second may act: 1 to 40 t, e from 0 to 1, low limits."""
-    worlds = np.zeros((n, sim.COLUMNS))
-    worlds[:, :2] = rng.uniform(0.01, 12, (n, 2)) * rng.choice([0.1, 0.4, 1, 2], (n, 2))
-    spread = rng.normal(0, 1, (n, 3)) * rng.choice([0.5, 2, 6], (n, 1))
-    worlds[:, sim.V_0 : sim.V_2 + 1] = np.clip(rng.uniform(3, 30, (n, 1)) + spread, 0, None)
-    front, middle, rear = rng.uniform(2, 9, (3, n))
-    harder = np.maximum(front, rear) + rng.choice([0, 0.5, 1, 2], n)
-    worlds[:, sim.A_0], worlds[:, sim.A_2] = front, rear
-    worlds[:, sim.A_1] = np.where(rng.random(n) < 0.85, harder, middle)
-    worlds[:, sim.DRIVE] = rng.uniform(0, 9, n) * rng.choice([0, 1], n)
-    worlds[:, sim.LIMIT] = worlds[:, sim.V_1] + rng.exponential(6, n) * rng.choice([0, 0.2, 1, 5], n)
-    worlds[:, sim.ONSET] = rng.uniform(0, 1.2, n) * rng.choice([0, 1], n)
-    alike, any_mass = rng.uniform(4, 7, (n, 3)), np.exp(rng.uniform(0, 3.7, (n, 3)))
-    worlds[:, sim.M_0 : sim.M_2 + 1] = np.where(rng.random((n, 1)) < 0.5, alike, any_mass)
-    worlds[:, sim.BOUNCE] = rng.uniform(0, 1, n) * rng.choice([0, 0.1, 0.3, 1], n)
-    return worlds
+STEP_S, HORIZON_S, DECISIONS = 0.1, 14.0, 24
+# moments at which a run looks for contacts: ten in each decision of a plan, then every decision
+MOMENTS_S = STEP_S * np.append(np.arange(10 * DECISIONS) / 10, np.arange(DECISIONS, round(HORIZON_S / STEP_S) + 1))
 
 
-def random_plans(worlds, rng, decisions=24):
-    """Commands, [n, decisions]: a few phases, or many; one in eight closes on the front vehicle to a mere touch."""
-    n = len(worlds)
-    ends = np.sort(rng.uniform(0, decisions, (n, 4)) * rng.choice([0.3, 0.6, 1], (n, 1)), axis=1)
+def random_plans(hardest, drive, rng):
+    """Commands, [n, DECISIONS], from ``-hardest`` to ``drive`` [n]: a few phases, or many, and braking in the end."""
+    n = len(drive)
+    ends = np.sort(rng.uniform(0, DECISIONS, (n, 4)) * rng.choice([0.3, 0.6, 1], (n, 1)), axis=1)
     share = np.where(rng.random((n, 5)) < 0.6, rng.choice([-1.0, 0, 1], (n, 5)), rng.uniform(-1, 1, (n, 5)))
-    phase = (np.arange(decisions)[np.newaxis, :, np.newaxis] >= ends[:, np.newaxis]).sum(axis=2)
-    phase = np.where(rng.random((n, 1)) < 0.7, phase, rng.integers(0, 5, (n, decisions)))
-    plan = np.take_along_axis(share, phase, axis=1)
-    plan = np.where(plan < 0, plan * worlds[:, [sim.A_1]], plan * worlds[:, [sim.DRIVE]])
-    closing = worlds[:, sim.V_1] - worlds[:, sim.V_0]
-    softly = -worlds[:, sim.A_0] - closing**2 / (2.0 * worlds[:, sim.GAP_0])
-    touch = (rng.random(n) < 0.125) & (closing > 0) & (softly > -worlds[:, sim.A_1])
-    until = np.where(touch, np.ceil(2.0 * worlds[:, sim.GAP_0] / np.maximum(closing, 1e-3) / STEP_S), 0.0)
-    plan = np.where(np.arange(decisions) < until[:, np.newaxis], softly[:, np.newaxis], plan)
-    plan[:, -1] = -worlds[:, sim.A_1]  # in the end it brakes to rest
-    return plan
+    phase = (np.arange(DECISIONS)[np.newaxis, :, np.newaxis] >= ends[:, np.newaxis]).sum(axis=2)
+    phase = np.where(rng.random((n, 1)) < 0.7, phase, rng.integers(0, 5, (n, DECISIONS)))
+    plans = np.take_along_axis(share, phase, axis=1)
+    plans[:, -1] = -1.0
+    return plans * np.where(plans < 0, hardest[:, np.newaxis], drive[:, np.newaxis])
 
 
-@numba.njit
-def play_all(worlds, plans, step, records, claims):
-    for k in range(len(worlds)):
-        sim.run(worlds[k], plans[k], step, HORIZON_S, records[k])
-        claims[k, 0], claims[k, 1] = sim.claim(worlds[k], records[k], step)
+def random_runs(n, rng):
+    """Worlds of three vehicles that the theorem covers, and plans: 1 to 40 t, e from 0 to 1, low limits.
+
+    In every third world the plan begins by closing to a mere touch, in front or behind, at the time of a decision.
+    """
+    gaps = rng.uniform(0.01, 12, (n, 2)) * rng.choice([0.1, 0.4, 1, 2], (n, 2))
+    spread = rng.normal(0, 1, (n, 3)) * rng.choice([0.5, 2, 6], (n, 1))
+    speeds = np.clip(rng.uniform(3, 30, (n, 1)) + spread, 0, None)
+    braking, limit = rng.uniform(2, 9, (n, 3)), np.full((n, 3), 60.0)
+    drive, latency = np.zeros((2, n, 3))
+    braking[:, 1] = np.maximum(braking[:, 0], braking[:, 2]) + rng.choice([0, 0.5, 1, 2], n)
+    drive[:, 1] = rng.uniform(0, 9, n) * rng.choice([0, 1], n)
+    limit[:, 1] = speeds[:, 1] + rng.exponential(6, n) * rng.choice([0, 0.2, 1, 5], n)
+    latency[:, 2] = rng.uniform(0, 2, n) * rng.choice([0, 1], n)
+    alike, any_mass = rng.uniform(4, 7, (n, 3)), np.exp(rng.uniform(0, 3.7, (n, 3)))
+    mass = np.where(rng.random((n, 1)) < 0.5, alike, any_mass)
+    bounce = np.minimum(mass[:, 1] / mass[:, 0], mass[:, 2] / mass[:, 1])
+    bounce = np.minimum(rng.uniform(0, 1, n) * rng.choice([0, 0.1, 0.3, 1], n), bounce)
+    plans = random_plans(braking[:, 1], drive[:, 1], rng)
+    # a touch: the neighbour's acceleration, and what takes the closing speed away until a decision
+    pair, until, each = rng.integers(0, 2, n), rng.integers(1, 10, n), np.arange(n)
+    closing = speeds[each, pair + 1] - speeds[each, pair]
+    away = np.where(pair == 0, -1, 1) * closing / (until * STEP_S)
+    softly = np.where(latency[each, 2 * pair] > 0, 0.0, -braking[each, 2 * pair]) + away
+    soft = (rng.random(n) < 0.33) & (closing > 0) & (softly > -braking[:, 1]) & (softly < drive[:, 1])
+    gaps[soft, pair[soft]] = 0.5 * (closing * until * STEP_S)[soft]
+    plans = np.where(soft[:, np.newaxis] & (np.arange(DECISIONS) < until[:, np.newaxis]), softly[:, np.newaxis], plans)
+    return three(gaps, speeds, braking, latency, drive=drive, limit=limit, mass=mass, restitution=bounce), plans
 
 
-def played(worlds, plans):
-    """Records of the runs, [n, RECORD], and the theorem's claims, [n, 2]: least cost, spare way."""
-    records, claims = np.zeros((len(worlds), sim.RECORD)), np.zeros((len(worlds), 2))
-    play_all(worlds, plans, STEP_S, records, claims)
-    return records, claims
+def box_of_touch_or_impact(box, rows, low, closing):
+    """Write closing speeds into two rows of the boxes; 0 stands for a touch."""
+    box[rows, low] = np.where(closing > 0, closing - 1e-9, 0.0)
+    box[rows, low + 1] = np.where(closing > 0, closing + 1e-9, TOUCH_MPS)
 
 
-def row_of(world):
-    """A world of the separate simulator as the proofs see it."""
-    at = np.zeros(row.LINE_COLUMNS)
-    at[[row.GAP_L, row.V_L, row.A_L]] = world[[sim.GAP_0, sim.V_0, sim.A_0]]
-    at[[row.V_F, row.A_F, row.U_F, row.LIMIT_F]] = world[[sim.V_1, sim.A_1, sim.DRIVE, sim.LIMIT]]
-    at[[row.GAP_R, row.V_R, row.A_R, row.ONSET_R]] = world[[sim.GAP_1, sim.V_2, sim.A_2, sim.ONSET]]
-    at[row.FRONT_SHARE] = world[sim.M_0] / (world[sim.M_0] + world[sim.M_1])
-    at[row.REAR_SHARE] = world[sim.M_2] / (world[sim.M_2] + world[sim.M_1])
-    at[row.BOUNCE], at[row.TIME_STEP] = world[sim.BOUNCE], STEP_S
-    return at
+def chains_of(state: State, plans: Floats):
+    """Play plans. Return the pair that touches first (0: in front; 2: both), [n], a box for each chain, and the cost.
+
+    -1: no pair touches.
+    """
+    n, line = state.n, state.line.copy()
+    wanted, box, first = np.zeros(state.wanted.shape), np.zeros((n, BOX_ROWS)), np.full(n, -1)
+    wanted[:, 1:] = -state.braking_capacity_mps2
+    box[:, SINCE : UNTIL + 1], seen, each = np.inf, np.zeros((n, 2), bool), np.arange(n)
+
+    def priced(rows):
+        """Push of the first pair; after a touch with what its first impact has changed."""
+        pair = np.maximum(first, 0) % 2
+        speed = np.sqrt(rows[each, FIRST, 1 + pair])
+        bounce = np.where(speed >= PLASTIC_MPS, state.restitution, 0.0)
+        return rows[each, PUSHED, 1 + pair] + np.where(box[:, HARD] <= TOUCH_MPS, (1.0 + bounce) * speed, 0.0)
+
+    for now, until in pairwise(MOMENTS_S):
+        wanted[:, 2], before = plans[:, min(int(now / STEP_S + 1e-9), DECISIONS - 1)], line.copy()
+        times = np.full(n, now), np.full(n, until)
+        assert advance_worlds(line, state.car, *times, wanted, scratch_for(4)) == -1
+        new = ((line[:, GAP, 1:3] == 0) | (line[:, HIT, 1:3] > 0)) & ~seen
+        if not new.any():
+            continue
+        begins = new.any(axis=1) & (first < 0)
+        second = new.any(axis=1) & ~begins & (first < 2)
+        first[begins] = np.where(new[begins].all(axis=1), 2, new[begins, 1])
+        closing = np.sqrt(line[:, FIRST, 1:3])[each, new.argmax(axis=1)]
+        for rows, time, speed in ((begins, EARLY, SOFT), (second, SINCE, SOFT_2)):
+            box[rows, time], box[rows, time + 1] = now, until
+            box_of_touch_or_impact(box, rows, speed, closing[rows])
+        box[second, PUSH], box[second, MOST_PUSH] = priced(before)[second], priced(line)[second] + 1e-9
+        seen |= new
+    alone = box[:, SINCE] == np.inf
+    box[alone, PUSH], box[alone, MOST_PUSH] = priced(line)[alone], priced(line)[alone] + 1e-9
+    return first, box, state._replace(line=line).harm("honest") + (line[:, SPEED, 1:] ** 2).sum(axis=1)
 
 
-def covered(worlds):
-    """Whether the theorem covers each world, [n]."""
-    front, middle, rear = worlds[:, sim.M_0], worlds[:, sim.M_1], worlds[:, sim.M_2]
-    bounce = worlds[:, sim.BOUNCE]
-    held = (bounce * front <= middle) & (bounce * middle <= rear)
-    return held & (worlds[:, sim.A_1] >= np.maximum(worlds[:, sim.A_0], worlds[:, sim.A_2]))
+def test_box__is_never_above_the_cost_of_a_chain_in_it():
+    rng = np.random.default_rng(3)
+    state, plans = random_runs(4000, rng)
+    first, boxes, cost = chains_of(state, plans)
+    rows = row.rows_of(state, 2, STEP_S)
+    chosen = np.flatnonzero((first >= 0) & (first < 2))
+    bound = np.array([chain_cost(first[k], rows[k], boxes[k], HORIZON_S) for k in chosen])
+    cost, first, boxes = cost[chosen], first[chosen], boxes[chosen]
+    assert (bound <= cost + 1e-6 * (1 + cost)).all() and (bound > 0.9 * cost).mean() > 0.3
+    touches, met = boxes[:, HARD] <= TOUCH_MPS, np.isfinite(boxes[:, UNTIL])
+    assert min((first[touches == touch] == kind).sum() for kind in (0, 1) for touch in (False, True)) > 20
+    assert min((first[met] == kind).sum() for kind in (0, 1)) > 500
 
 
-def unavoidable(at):
-    """Whether contact with a neighbour is unavoidable, and none comes before the vehicle may act."""
-    verdict = np.zeros(VERDICT)
-    decide(at, verdict)
-    return verdict[REASON] >= FRONT
+TOUCHED = {  # kind of the first contact, at 20 m/s and at once -> world in which another contact follows after 1 s
+    FRONT_FIRST: lambda way: at(V_L=20, A_L=1e-9, V_F=20, GAP_R=30 - way, V_R=30),
+    REAR_FIRST: lambda way: at(GAP_L=way, V_L=0, A_L=5, V_F=20, V_R=20),
+}
 
 
-def box_around(record, rng, size):
-    """A box that contains the chain of this record: its ranges are up to ``size`` times as wide as usual."""
-    first = [record[sim.TIME], record[sim.CLOSING], record[sim.PUSH] + record[sim.GAINED]]
-    centre = np.array([*first, record[sim.TIME_2], record[sim.CLOSING_2]])  # without a second contact: infinite
-    lower, upper = rng.uniform(0, size, (2, 5)) * np.array([0.2, 1.0, 1.0, 0.2, 1.0])
-    low, high = np.maximum(centre - lower, 0.0), centre + upper
-    if record[sim.CLOSING] <= TOUCH_MPS:
-        low[1], high[1] = 0.0, TOUCH_MPS
-    else:
-        low[1] = max(low[1], TOUCH_MPS)
-    return np.array([0.0, *np.column_stack([low, high]).ravel()])
-
-
-def test_separate_simulator__agrees_with_the_package():
-    n, rng = 400, np.random.default_rng(1)
-    state = wide_worlds(n, 3, seed=77)
-    start, full = state.car[:, LATENCY, 2], np.pad(-state.braking_capacity_mps2, ((0, 0), (1, 0)))
-    now = hold_commands(state._replace(wanted=full), start)
-    keep = (now.harm("honest") == 0) & (now.gaps_m.min(axis=1) > 0) & (now.car[:, LATENCY, 1] <= start)
-    now, start = now.take(keep), start[keep]
-    worlds = np.zeros((now.n, sim.COLUMNS))
-    worlds[:, :5] = np.hstack([now.gaps_m, now.speeds_mps])
-    worlds[:, [sim.A_0, sim.A_1, sim.A_2]] = now.braking_capacity_mps2
-    worlds[:, sim.DRIVE], worlds[:, sim.LIMIT] = now.driving_capacity_mps2[:, 1], now.car[:, LIMIT, 2]
-    worlds[:, sim.ONSET] = np.maximum(now.car[:, LATENCY, 3] - start, 0.0)
-    worlds[:, sim.M_0 : sim.M_2 + 1], worlds[:, sim.BOUNCE] = now.car[:, MASS, 1:], now.restitution
-    plans = random_plans(worlds, rng)
-    core = played(worlds, plans)[0][:, sim.CORE]
-    line, time, wanted = now.line.copy(), start, full[keep].copy()
-    for k in range(round(HORIZON_S / STEP_S)):
-        wanted[:, 2] = plans[:, min(k, plans.shape[1] - 1)]
-        assert advance_worlds(line, now.car, time, start + (k + 1) * STEP_S, wanted, scratch_for(4)) == -1
-        time = start + (k + 1) * STEP_S
-    cost = (line[:, TOTAL] + line[:, PASSED] + 10 * line[:, PUSHED] - now.line[:, PASSED]).sum(axis=1)
-    assert core == pytest.approx(cost, rel=1e-7, abs=1e-7) and now.n > 200 < core.mean()
-
-
-@pytest.mark.parametrize("runs", [20_000, pytest.param(2_000_000, marks=pytest.mark.slow)])
-def test_theorem__holds_in_every_run_of_a_separate_simulator(runs):
-    rng = np.random.default_rng(2)
-    for _ in range(runs // 4000):
-        worlds = random_worlds(4000, rng)
-        records, claims = played(worlds, random_plans(worlds, rng))
-        assert records[:, [sim.EXCESS_MPS, sim.EXCESS_M]].max() < 1e-8  # lemmas 1 and 2
-        assert (records[:, sim.CORE] - claims[:, 0] > -1e-6 * (1 + records[:, sim.CORE])).all() and claims[
-            :, 1
-        ].min() > -1e-7
-        for k in range(0, 4000, 16):
-            driven = sim.claimed_driving(worlds[k], records[k], STEP_S)
-            assert records[k, sim.DROVE] > driven[0] - 0.01 and records[k, sim.DROVE_2] > driven[1] - 0.01
-    second = np.isfinite(records[:, sim.TIME_2])
-    touched = (records[:, sim.FIRST] == 0) & (records[:, sim.CLOSING] <= TOUCH_MPS)
-    assert (second & (records[:, sim.FIRST] == 0)).sum() > 100 < (second & (records[:, sim.FIRST] == 1)).sum()
-    assert touched.sum() > 3
-
-
-@pytest.mark.parametrize("size", [0.0, 0.3])
-def test_box__is_never_above_the_cost_of_a_chain_in_it(size):
-    rng, near, tried = np.random.default_rng(3), 0, 0
-    worlds = random_worlds(20_000, rng)
-    records, claims = played(worlds, random_plans(worlds, rng))
-    chosen = covered(worlds) & (records[:, sim.FIRST] >= 0) & (records[:, sim.FIRST] < 2)
-    for k in np.flatnonzero(chosen):
-        record = records[k]
-        bound = chain_cost(record[sim.FIRST], row_of(worlds[k]), box_around(record, rng, size), HORIZON_S)
-        cost = record[sim.COST]
-        assert bound <= cost + 1e-6 * (1 + cost)
-        near, tried = near + (bound > 0.99 * claims[k, 0] - 0.01), tried + 1
-    assert tried > 3000 and (near > 0.95 * tried or size > 0.1)  # a small box says what the theorem says
+@pytest.mark.parametrize("kind", TOUCHED)
+def test_touches__push_a_little_for_nothing(kind):
+    """Four of 1e-5 m/s in each of ten decisions and at both ends, of which half moves each of the pair: 0.24 mm."""
+    box = np.array([0, 0, 0, 0, 0, 0, 0, 1, 1, 10, 10]) + (kind == REAR_FIRST) * np.array([0] * 9 + [10, 10.0])
+    costs = []
+    for way in (20.00023, 20.00025):
+        world = TOUCHED[kind](way)
+        world[[row.A_F, row.A_R, row.ONSET_R, row.LIMIT_F, row.TIME_STEP]] = 8, 4, 5, 40, STEP_S
+        world[[row.FRONT_SHARE, row.REAR_SHARE]] = 0.5
+        costs.append(chain_cost(kind, world, box, HORIZON_S))
+    assert box[SOFT_2] ** 2 <= costs[0] < 1000 and costs[1] == math.inf
 
 
 def test_pieces__by_hand():
-    at = row_of(np.zeros(sim.COLUMNS) + 1.0)
-    at[row.BOUNCE], at[row.FRONT_SHARE], at[row.REAR_SHARE] = 0.1, 0.4, 0.5
+    world = at(BOUNCE=0.1, FRONT_SHARE=0.4, REAR_SHARE=0.5, V_L=1, A_L=1, V_F=1, A_F=1, LIMIT_F=1, V_R=1, ONSET_R=1)
     # 6 m/s of closing, of which an impact from behind threw 2: 36 + 10 * 1.1 * 4; below 0.05 m/s nothing bounces
-    assert third_cost(at, 6.0, 2.0) == pytest.approx(36 + 44 - 11 * TOUCH_MPS, rel=1e-12)
-    assert third_cost(at, 0.04, 0.0) == pytest.approx(0.0016 + 0.4 - 10 * TOUCH_MPS, rel=1e-12)
+    assert third_cost(world, 6.0, 2.0) == pytest.approx(36 + 44 - 11 * TOUCH_MPS, rel=1e-12)
+    assert third_cost(world, 0.04, 0.0) == pytest.approx(0.0016 + 0.4 - 10 * TOUCH_MPS, rel=1e-12)
     # 5 m/s faster, 9 / 8 m behind, 4 m/s2: 25 - 9 = 4^2; driving 2 m/s away at once avoids it for 20
-    at[row.A_R], at[row.LIMIT_F], at[row.U_F] = 4.0, 40.0, 0.0
-    assert third_at_rear(at, 1.125, 10.0, 15.0, 0.0, 9.0, 0.0) == pytest.approx(60 - 11 * TOUCH_MPS)
-    at[row.U_F] = 1000.0
-    assert 12 < third_at_rear(at, 1.125, 10.0, 15.0, 0.0, 9.0, 0.0) <= 20
+    world[row.A_R], world[row.LIMIT_F], world[row.U_F] = 4.0, 40.0, 0.0
+    assert third_at_rear(world, 1.125, 10.0, 15.0, 0.0, 9.0, 0.0) == pytest.approx(60 - 11 * TOUCH_MPS)
+    world[row.U_F] = 1000.0
+    assert 12 < third_at_rear(world, 1.125, 10.0, 15.0, 0.0, 9.0, 0.0) <= 20
     # after a touch an impact of 3 m/s pushes 3.3 m/s for 9; beyond 5.5 m/s of impact the push is cheaper
-    assert [price_of(at, 3.3, w) for w in (0.0, 1.0)] == pytest.approx([9, 33])
-    assert price_of(at, 10.0, 0.0) == pytest.approx(5.5**2 + 10 * (10 - 1.1 * 5.5))
+    assert [price_of(world, 3.3, w) for w in (0.0, 1.0)] == pytest.approx([9, 33])
+    assert price_of(world, 10.0, 0.0) == pytest.approx(5.5**2 + 10 * (10 - 1.1 * 5.5))
     assert slowing(0.5, 0.1, 1.0, 2.0) == pytest.approx(0.9) and slowing(0.5, 0.1, 0.0, 0.04) == pytest.approx(0.02)
     # from 10 to 10 m/s in 2 s over 16 m: down to 6 at 4 m/s2 and up again: 2 * (10 * 1 - 4 / 2)
     assert cruise(10.0, 10.0, 2.0, 4.0, 4.0, 16.0) == pytest.approx(6.0)
     assert cruise(10.0, 10.0, 2.0, 4.0, 4.0, 21.0) == 10.0 and cruise(10.0, 10.0, 2.0, 4.0, 4.0, 15.9) == -math.inf
     # all three at once, 4 and 2 m/s: (4 + 0.55 * 2)^2 + (2 + 0.44 * 4)^2; the front pair closes with at least 4
     exact = (4 + 0.55 * 2) ** 2 + (2 + 0.44 * 4) ** 2
-    assert 0.95 * exact < triple_contact(at, 4.0, 6.0) <= exact
-
-
-@numba.njit
-def climb(world, plans, changes, step, horizon, record):
-    """Least cost of ``plans`` and of plans that change the best of them: all rows of ``changes`` (first and last
-    decision, change of the command) one after the other.
-    """
-    best, least = plans[0], np.inf
-    for k in range(len(plans) + len(changes)):
-        plan = plans[k] if k < len(plans) else best.copy()
-        if k >= len(plans):
-            first, last, size = changes[k - len(plans)]
-            plan[int(first) : int(last)] += size
-            plan = np.minimum(np.maximum(plan, -world[sim.A_1]), world[sim.DRIVE])
-        sim.run(world, plan, step, horizon, record)
-        if record[sim.COST] < least:
-            least, best = record[sim.COST], plan
-    return least
-
-
-def attacked(worlds, horizons, tries, rng, known=None):
-    """Least cost of ``tries`` plans in each world, [n]: random ones, and changes to the best of them.
-
-    ``known``: one plan of each world to begin with, [n, decisions].
-    """
-    least, record = np.zeros(len(worlds)), np.zeros(sim.RECORD)
-    for k, world in enumerate(worlds):
-        plans = random_plans(np.tile(world, (tries // 4, 1)), rng, decisions=40)
-        if known is not None:
-            plans[0] = known[k, :40]
-        first, size = rng.integers(0, 30, tries - len(plans)), 8.0 * 10.0 ** rng.uniform(-3, 0, tries - len(plans))
-        change = np.column_stack([first, first + rng.integers(1, 8, len(first)), size * rng.normal(size=len(first))])
-        least[k] = climb(world, plans, change, STEP_S, horizons[k], record)
-    return least
+    assert 0.95 * exact < triple_contact(world, 4.0, 6.0) <= exact
 
 
 def test_bound__of_a_plan_that_an_attacker_found():
@@ -258,22 +203,30 @@ def test_bound__of_a_plan_that_an_attacker_found():
 
 @pytest.mark.parametrize("cost", [1e-3, 4.0, 30.25, 30.26, 900.0])
 def test_most_push__is_the_inverse_of_the_price(cost):
-    at = np.zeros((1, row.LINE_COLUMNS))
-    at[0, row.BOUNCE] = 0.1
+    world = at(BOUNCE=0.1)
     for touch, closing in ((False, 1.0), (True, 0.5 * TOUCH_MPS)):
-        assert price_of(at[0], most_push(at[0], touch, cost), closing) == pytest.approx(cost, rel=1e-12)
+        assert price_of(world, most_push(world, touch, cost), closing) == pytest.approx(cost, rel=1e-12)
 
 
-def test_bound__no_plan_is_below_it_in_random_worlds():
-    rng, boxes, memory = np.random.default_rng(4), np.empty((BOX_ROWS, 20_000)), np.empty((2, BOX_ROWS))
-    worlds = random_worlds(400, rng)
-    worlds = worlds[covered(worlds)]
-    worlds = worlds[[unavoidable(row_of(world)) for world in worlds]]
-    rows = np.array([row_of(world) for world in worlds])
-    bounds = np.array([chain_bound(at, HORIZON_S, boxes, memory) for at in rows])
-    inside = np.array([last_rest(at) < HORIZON_S for at in rows])
-    least = attacked(worlds[inside], np.full(len(worlds), HORIZON_S), 80, rng)
-    assert (bounds > 1).sum() > 50 and (least >= bounds[inside]).all()
+@pytest.mark.nightly
+def test_bound__no_plan_is_below_it_in_random_worlds(size):
+    rng = np.random.default_rng(4)
+    state, best = random_runs(400 * size, rng)
+    some = np.flatnonzero(avoidability(state).reason >= FRONT)
+    state, best = state.take(some), best[some]
+    bound = lower_bound(state, count="honest", horizon_s=HORIZON_S, time_step_s=STEP_S).harm
+    hardest, drive, each = state.braking_capacity_mps2[:, 1], state.driving_capacity_mps2[:, 1], np.arange(DECISIONS)
+    least = chains_of(state, best)[2]
+    for k in range(100):
+        begin, much = rng.integers(0, DECISIONS, (state.n, 1)), 8.0 * 10.0 ** rng.uniform(-3, 0, (state.n, 1))
+        changed = (each >= begin) & (each < begin + rng.integers(1, 8, (state.n, 1)))
+        change = changed * much * rng.normal(size=(state.n, 1))
+        plans = random_plans(hardest, drive, rng) if k < 20 else best + change
+        plans = np.clip(plans, -hardest[:, np.newaxis], drive[:, np.newaxis])
+        cost = chains_of(state, plans)[2]
+        best, least = np.where((cost < least)[:, np.newaxis], plans, best), np.minimum(least, cost)
+    print(f"{state.n} worlds; {np.mean(bound > 0.9 * least):.1%} of the bounds are near the least cost of 101 plans")
+    assert (bound > 1).sum() > 50 and (least >= bound).all()
 
 
 # the bounds of the first six worlds, and the least share of the best known cost

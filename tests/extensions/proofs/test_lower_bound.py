@@ -18,7 +18,7 @@ from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LARGE, REAR_FIRST
 from ethbrake_marl.extensions.proofs.lower_bound import front_first, lower_bound, rear_first, rounding
 from ethbrake_marl.extensions.proofs.meetings import gentlest, gentlest_front, meet_front, meet_rear
 from ethbrake_marl.motion.layout import FAR_M, HIT, SPEED
-from tests.extensions.proofs.worlds import opening, play, searched_harm, wide_worlds, worlds
+from tests.extensions.proofs.worlds import at, opening, play, searched_harm, wide_worlds, worlds
 from tests.motion.lines import lines
 from tests.refused import refused
 
@@ -144,13 +144,6 @@ def test_decisions__leave_less_room_and_no_plan_is_below():
 
 
 # What a first contact leaves, and what the command in force costs.
-
-
-def at(**given):
-    values = np.zeros(row.LINE_COLUMNS)
-    for name, value in given.items():
-        values[getattr(row, name)] = value
-    return values
 
 
 def random_rows(n, seed):

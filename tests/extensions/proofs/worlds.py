@@ -9,6 +9,7 @@ import numpy as np
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import at_alert
 from ethbrake_marl.evaluation.record import advance_worlds
+from ethbrake_marl.extensions.proofs import line as row
 from ethbrake_marl.motion.layout import FAR_M, LIMIT, Floats, scratch_for
 from tests.motion.lines import lines
 
@@ -27,6 +28,14 @@ def worlds(gaps: Any, speeds: Any, braking: Any, latency: Any = 0.0, **settings:
 
 def paper_line(gaps: Any, speeds: Any, latency: Any) -> State:
     return worlds(gaps, speeds, [6, 7, 6], latency, drive=[6, 7, 6], mass=[4.5, 5.5, 5.9])
+
+
+def at(**given: float) -> Floats:
+    """One world as the proofs see it: its columns by name, 0 where none is given."""
+    values = np.zeros(row.LINE_COLUMNS)
+    for name, value in given.items():
+        values[getattr(row, name)] = value
+    return values
 
 
 def opening(gap: float) -> State:

@@ -55,6 +55,7 @@ def test_film__plays_in_real_time_and_ends_with_the_longest(ending: str, tmp_pat
     assert [frame.info["duration"] for frame in ImageSequence.Iterator(shown)] == [*33 * [40], 2000]
 
 
+@pytest.mark.slow
 def test_watch__makes_the_film_of_the_readme(ethbrake: Command, empty_folder: Path) -> None:
     pytest.importorskip("ethbrake_marl.extensions.forecasts")  # which `universal` observes
     file = DOCS / "figures" / "emergency.gif"

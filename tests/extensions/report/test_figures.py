@@ -8,7 +8,6 @@ import pytest
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import (
@@ -37,9 +36,7 @@ def legend(figure: Figure) -> list[str]:
 
 
 def record_of(world: int, agent: str, scenario: str = "paper-random") -> eb.EpisodeRecord:
-    loaded, game = eb.open_game(scenario)
-    (team,) = teams_of(agent, loaded).values()
-    return eb.record_episode(loaded.sample(1, 7, first=world), team, game)
+    return eb.record_episode(scenario, agent, number=world)
 
 
 # ---- all figures
@@ -171,7 +168,7 @@ def test_curves__are_means_with_bands_and_lines() -> None:
 
 def test_trajectories__lines_and_impacts_are_those_of_the_record() -> None:
     record = record_of(0, "ppo")
-    figure = trajectories({"PPO": record})
+    figure = trajectories("paper-random", {"PPO": "ppo"})
     above, gaps, commands = figure.axes
     for i in range(3):
         assert above.lines[i].get_ydata().tolist() == record.positions_m[:, i].tolist()
@@ -193,7 +190,7 @@ def test_trajectories__lines_and_impacts_are_those_of_the_record() -> None:
 
 def test_trajectories__of_a_team_show_the_commands_of_each_learner_and_the_obstacle() -> None:
     record = record_of(0, "full_brake", "cooperation-4-all")
-    above, _, commands = trajectories({"a": record}).axes
+    above, _, commands = trajectories("cooperation-4-all", "full_brake").axes
     assert commands.get_ylabel() == "Command of\nVehicles 1, 2, 3 (m/s²)"
     obstacle = next(line for line in above.lines if line.get_label() == "obstacle")
     assert obstacle.get_ydata()[0] == record.initial.obstacle_gap_m[0]
@@ -220,7 +217,7 @@ def worlds_of(name: str, n: int) -> eb.State:
 @pytest.mark.parametrize(
     ("draw", "said"),
     [
-        (lambda: trajectories({}), "there are no records; give at least one"),
+        (lambda: trajectories("paper-random", {}), "agents = {}: must be names"),
         (lambda: picture_bytes(new_figure(1.0, 1.0), "a.jpg"), "must end in .png, .svg or .pdf"),
         (lambda: deceleration_figure(worlds_of("paper-random", 2), "paper-random"), "2 worlds, 1 learners, 0 scripts"),
         (lambda: deceleration_figure(worlds_of("cooperation-3-pair", 1), "cooperation-3-pair"), "1 worlds, 2 learners"),

@@ -17,6 +17,7 @@ from ethbrake_marl.extensions.report.best_known import UNAVOIDABLE
 from ethbrake_marl.extensions.report.episodes import (
     MOTION_SAMPLE_S,
     episode_data,
+    episodes_section,
     pieces_of,
     replaced_at_s,
     shown_worlds,
@@ -77,6 +78,19 @@ def test_first_sentence__of_the_honest_cost() -> None:
     )
     assert first_sentence(mine, "full_brake", {}) == (
         f"Full braking costs {before:.2f} m²/s² per emergency (honest cost; total harm: {much:.2f})."
+    )
+
+
+def test_first_sentence__compares_with_full_braking_wherever_it_stands_and_in_each_test() -> None:
+    agents = "coast,full_brake,ppo"
+    main, other = (compared_by(name, agents, 200) for name in ("paper-random", "paper-random-obstacle"))
+    means = [
+        [one.result[agent]["first_impact_harm"].mean() for agent in ("ppo", "full_brake")] for one in (main, other)
+    ]
+    (after, before), (there, braked) = means
+    assert first_sentence(main, "ppo", {"Obstacle test": other}) == (
+        f"ppo does {100 * (1 - after / before):.0f} % less harm than full braking (first impacts: {after:.2f} m²/s² per"
+        f" emergency instead of {before:.2f}), but more in the obstacle test ({there:.2f} instead of {braked:.2f})."
     )
 
 
@@ -258,6 +272,17 @@ def test_page__says_who_did_not_repeat_itself(html: str) -> None:
 
     text = ReportPage("t", compared_by("paper-random", {"fickle": Fickle()}, 5), "s", {}).html
     assert re.search(r"In [1-5] worlds? of these, fickle drove differently", text) and "drove differently" not in html
+
+
+def test_episodes__are_compared_with_the_evaluation_in_both_counts(compared: Comparison) -> None:
+    columns = {
+        agent: {name: values.copy() for name, values in own.items()} for agent, own in compared.result.columns.items()
+    }
+    columns["ppo"]["total_harm"][3] += 1.0
+    columns["ppo"]["first_impact_harm"][5] += 1.0
+    changed = compared._replace(result=replace(compared.result, columns=columns))
+    text = " ".join(map(str, episodes_section(changed, "ppo", dict.fromkeys([3, 5, 7], "shown")).body))
+    assert "In 2 worlds of these, ppo drove differently" in text and text.count("drove differently") == 1
 
 
 # ---- the whole page

@@ -11,9 +11,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EXTRA_OF
 from ethbrake_marl.evaluation.comparison import Comparison
-from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, is_papers_test, printed_sheet
-from ethbrake_marl.extensions.report.run import learners_sheets, typical_row_of
-from ethbrake_marl.extensions.report.three_tests import TESTS, is_as_shipped, other_tests, short_sheet
+from ethbrake_marl.extensions.report.run import TESTS, learners_sheets, other_tests, short_sheet, typical_row_of
 from ethbrake_marl.training.experiment import run_experiment
 from tests.cli.test_run import ctrl_c_when, status_of
 from tests.extensions.report.conftest import compared_by
@@ -23,25 +21,23 @@ from tests.test_imports import ended
 from tests.training.tiny import TINY
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
-PICTURES = {"learning_curve.png", "harm_against_gap.png", "trajectories.png"}
 
 
 # ---- the folder of a run
 
 
-def test_run__leaves_results_pictures_page_and_policy(finished_run: Path) -> None:
+def test_run__leaves_results_page_and_policy(finished_run: Path) -> None:
     names = {path.name for path in finished_run.iterdir()}
     others = {f"results-{name}.json" for name in TESTS if name != "paper-random"}
-    assert names >= {"config.json", "policy", "results.json", "worlds.csv", "report.html", *PICTURES, *others}
+    assert names >= {"config.json", "policy", "results.json", "worlds.csv", "report.html", *others}
     html = (finished_run / "report.html").read_text()
-    assert html.count("<figure>") == html.count("data:image/svg") == 5  # three of them are in the pictures, too
+    assert html.count("<figure>") == html.count("data:image/svg") == 5
     assert html.count('"pieces":') == 50 * len(AGENTS)
     page = Page(html)
-    assert "Nothing in this package is tuned to these rows" in page.text and "33.5878" in page.text
     assert "ethbrake run: paper-random" in page.text and ", on paper-random: 256 steps of 256 (finished)" in page.text
     titles = [attributes.get("id") for tag, attributes in page.tags if tag == "section"]
     assert titles[:4] == ["brake-only-test", "obstacle-test", "learning-curve", "worst-ten-worlds"]
-    assert {"agents-and-measures", "the-paper's-rows", "figures", "versions"} <= {*titles[4:]}
+    assert {"agents-and-measures", "figures", "versions"} <= {*titles[4:]}
     assert len(re.findall(r"<details><summary>\s*<h2", html)) == len(titles) - 4  # all others are folded
     header, main = html.split("<main")
     assert 'class="player"' in header and 'class="player"' not in main  # an episode plays before any section
@@ -53,7 +49,7 @@ def test_run__leaves_results_pictures_page_and_policy(finished_run: Path) -> Non
     ):
         assert words in header
     assert status_of(finished_run, "status", "stage", "steps", "reason") == ("finished", "evaluation", 256, None)
-    assert {*status_of(finished_run, "written")[0]} >= {"report.html", *PICTURES, *others}
+    assert {*status_of(finished_run, "written")[0]} >= {"report.html", *others}
 
 
 def test_run__the_other_two_tests_stand_beside_the_main_one(finished_run: Path) -> None:
@@ -81,7 +77,7 @@ def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(
     assert "The training was interrupted. This is the trained policy" in (folder / "report.html").read_text()
     assert ethbrake("train", "--resume", folder).status == 0
     assert status_of(folder, "status", "steps") == ("finished", 256)
-    assert not [*folder.glob("*.html"), *folder.glob("*.png"), *folder.glob("results*")]  # of the policy before
+    assert not [*folder.glob("*.html"), *folder.glob("results*")]  # of the policy before
 
 
 def test_several_learners__who_bears_what_and_what_each_adds(tmp_path: Path) -> None:
@@ -126,38 +122,19 @@ def test_three_tests__are_each_others_and_of_the_shipped_scenarios_only() -> Non
         assert {name, *(each.name for each in other_tests(eb.load_scenario(name)))} == {*TESTS}
     changed = eb.load_scenario("paper-random").replace(horizon_s=9.0)
     assert other_tests(changed) == other_tests(eb.load_scenario("realistic-pair")) == []
-    assert is_as_shipped(eb.load_scenario("paper-random").replace(title="Mine")) and not is_as_shipped(changed)
-    assert is_papers_test(eb.load_scenario("paper-random-early")) and not is_papers_test(changed)
+    assert len(other_tests(eb.load_scenario("paper-random").replace(title="Mine"))) == 2
 
 
 @pytest.mark.parametrize("count", ["first", "honest"])
-def test_brief__has_both_harms_of_each_test_and_the_honest_cost_with_the_push(count: str) -> None:
-    main = compared_by("paper-random", "full_brake,coast,constant:3", 30, count)
-    other = compared_by("paper-random-obstacle", "full_brake,coast", 30, count)
-    sheet = short_sheet(main, {"paper-random-obstacle": other})
+def test_terminal__shows_both_harms_and_the_honest_cost_with_the_push_if_agents_minimise_it(count: str) -> None:
+    mine = compared_by("paper-random", "full_brake,coast,constant:3", 30, count)
+    sheet = short_sheet(mine)
     names = ["collision_rate", "first_impact_harm", "total_harm"]
     names += ["honest_cost", "pushed_mps"] if count == "honest" else []
-    assert sheet.names[1:] == names and sheet.keep is None
-    own, heading, below = sheet.rows[:3], sheet.rows[3], sheet.rows[4:]
-    assert heading == "Obstacle test: 30 worlds"
-    for rows, result in ((own, main.result), (below, other.result)):
-        assert [row[0].partition("\n")[0].removesuffix(" ‡") for row in rows] == [*result.columns]
-        for row, columns in zip(rows, result.columns.values(), strict=True):
-            means = [columns["collided" if name == "collision_rate" else name].mean() for name in names]
-            assert [cell.value for cell in row[1:]] == pytest.approx(means)
-    assert own[0][2].interval is not None and below[0][2].interval is None
-    assert "1.7 m beyond the place where Vehicle 1 stops by itself" in sheet.note
-    assert "total harm includes pushing Vehicle 1; the honest cost does" in TESTS["paper-random"]
-
-
-def test_paper_rows__are_consistent_and_shown_as_printed() -> None:
-    for paper in (*RANDOM_TEST, *HYBRID_TEST):
-        assert paper.collision_rate == pytest.approx(paper.collisions / paper.episodes, abs=5e-5)
-        if paper.harm_decrease is not None:
-            assert paper.harm_decrease == pytest.approx(1 - paper.average_harm / 33.5878, abs=2e-4)
-    sheet = printed_sheet(RANDOM_TEST)
-    assert sheet.rows[1] == ["E-V2X-BM", "8,520", "85.2 %", "9.8772", "70.59 %"] and "10,000 worlds; d" in sheet.note
-    assert printed_sheet(HYBRID_TEST).rows[2] == ["Hybrid", "2,995", "59.9 %", "7.3641"]
+    assert sheet.names[1:] == names
+    for row, columns in zip(sheet.rows, mine.result.columns.values(), strict=True):
+        means = [columns["collided" if name == "collision_rate" else name].mean() for name in names]
+        assert [cell.value for cell in row[1:]] == pytest.approx(means)
 
 
 # ---- pages and pictures of commands

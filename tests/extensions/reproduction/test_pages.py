@@ -8,12 +8,12 @@ from typing import get_args
 import pytest
 
 from ethbrake_marl import __version__
-from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.reproduction import curves, learning, strategies, tables
 from ethbrake_marl.extensions.reproduction.items import ITEMS
 from ethbrake_marl.extensions.reproduction.learning import Course
 from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.reproduction.random_test import NON_E, SHIPPED_SPECS, report_outcome
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED
 from ethbrake_marl.extensions.reproduction.verdicts import REASONS, Verdict, paper_texts

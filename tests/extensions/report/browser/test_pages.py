@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 
-import ethbrake_marl as eb
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.extensions.report.report import ReportPage
@@ -116,9 +115,8 @@ def test_player__ends_with_the_ledger_in_fifty_worlds_and_counts_never_fall(
 
 
 def test_player__places_are_those_of_the_recorded_episode(report_page: Any, compared: Comparison) -> None:
-    number, (scenario, game) = report_page.evaluate(f"{PLAYER}.data.worlds[0].number"), eb.open_game("paper-random")
-    world = scenario.sample(1, 7, first=number)
-    record = record_episode(world, compared.teams["full_brake"], game, 0.005)
+    number = report_page.evaluate(f"{PLAYER}.data.worlds[0].number")
+    record = record_episode("paper-random", compared.teams["full_brake"], number=number, sample_s=0.005)
     report_page.evaluate(f"{PLAYER}.shown = [0]; {PLAYER}.build()")
     for k in range(0, len(record.time_s), 27):
         state = report_page.evaluate(f"stateAt({PLAYER}.episodes()[0], {float(record.time_s[k])!r})")
