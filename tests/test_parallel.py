@@ -4,6 +4,7 @@ import os
 
 import pytest
 
+from ethbrake_marl import parallel
 from ethbrake_marl.parallel import WorkerLost, run_each
 
 
@@ -25,7 +26,6 @@ def test_process__that_is_killed_is_an_error_and_each_has_one_thread() -> None:
     assert [*run_each(((os.getenv, "OMP_NUM_THREADS") for _ in range(3)), 2)] == ["1"] * 3
     with pytest.raises(WorkerLost, match="use fewer processes"):
         list(run_each([(os._exit, 3)], 2))
-
 
 
 @pytest.mark.parametrize(("cores", "jobs", "processes", "share"), [(5, 2, 2, 2), (3, 8, 3, 1), (2, 2, 2, 1)])
