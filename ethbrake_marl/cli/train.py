@@ -135,6 +135,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     from ethbrake_marl.cli.settings import read_settings
     from ethbrake_marl.episode.counts import HONEST, IMPACT_COUNTS
     from ethbrake_marl.files.plain import read_object
+    from ethbrake_marl.files.python_file import loaded_files
     from ethbrake_marl.training.fixed_list import OBJECTIVE_METRIC, full_braking
 
     training, plan = result.training, result.training.recipe
@@ -161,7 +162,8 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     options = [setting for setting in settings if read_settings([setting], [*type(plan).model_fields]).scenario]
     options += [f"harm_count={count.name}"] * (count != HONEST)
     place = training.lines[0].scenario.name if training.scenario.lines else scenario or training.scenario.name
-    words = ["--scenario", place, "--agents", f"full_brake,{result.agent}"]
+    words = [word for file in loaded_files() for word in ("--load", file)]
+    words += ["--scenario", place, "--agents", f"full_brake,{result.agent}"]
     command = shlex.join(
         ["ethbrake", "evaluate", *words, *(word for setting in options for word in ("--set", setting))]
     )

@@ -43,6 +43,21 @@ def test_train__ends_with_harm_beside_full_braking_and_a_command_that_measures_t
         assert f"{row['first_impact_harm']:.2f}" in answer.out and f"{row['total_harm']:.2f}" in answer.out
 
 
+def test_train__with_a_file_of_ones_own_prints_a_command_that_loads_it_again(
+    ethbrake: Command, tiny_recipe: Path, empty_folder: Path
+) -> None:
+    Path("own.py").write_text(
+        "import ethbrake_marl as eb\n"
+        "def heavy(state, body):\n    '''Mass.'''\n    return state.mass_t[:, body - 1]\n"
+        "eb.register_feature('heavy', heavy, unit='t', scale=10.0, low=0.0, high=9.0)\n"
+    )
+    words = ("--recipe", tiny_recipe, "--set", "recipe.observation=[own, heavy]", "--output", "runs/mine")
+    check_refused(ethbrake("train", *words), "unknown feature 'heavy'")
+    command = ethbrake("train", *words, "--load", "own.py").out.splitlines()[-1]
+    assert f"--load {Path('own.py').resolve()} " in command
+    assert ethbrake(*shlex.split(command)[1:], "--episodes", "3").status == 0
+
+
 @pytest.mark.parametrize("command", ["train", "run"])
 def test_folder_that_exists__is_refused_before_torch_is_loaded(command: str, empty_folder: Path) -> None:
     Path("mine").mkdir()

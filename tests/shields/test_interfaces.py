@@ -192,7 +192,7 @@ def test_a_shield_that_is_registered_for_names_is_a_mode() -> None:
 
 @pytest.mark.parametrize("named", [{}, {"scenario": "paper-random"}], ids=str)
 def test_a_network__is_refused_with_the_name_of_the_function_that_makes_it_an_agent(named: dict[str, str]) -> None:
-    with pytest.raises(InvalidInput, match=r"nor an agent or a team; make an agent of .* eb.shield\(eb.policy_agent\("):
+    with pytest.raises(InvalidInput, match=r"must be a team, .* make an agent of .* eb.shield\(eb.policy_agent\("):
         shield(lambda seen: seen[:, :1], **named)
 
 
