@@ -33,7 +33,7 @@ def drives(state: State, body: int) -> Floats:
 
 
 def test_range__is_that_of_the_decisions_before_rest_without_any_fallback() -> None:
-    """From 5.7 m/s 0.6 m/s less at each of ten decisions; the least and the largest are left out; the unit is 20 m/s."""
+    """5.7 m/s, and 0.6 m/s less at each of ten decisions, without the least and the largest; the unit is 20 m/s."""
     register_feature("drives", drives, unit="1", scale=1.0, low=-1.0, high=1.0)
     never = TrainingRange(low=(9.0,) * 3, high=(9.0,) * 3, fallback="drives")
     policy = full_braking("own.speed", "own.acceleration", "front_1.gap").with_range(never)
