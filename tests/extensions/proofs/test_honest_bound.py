@@ -145,6 +145,20 @@ def test_box__is_never_above_the_cost_of_a_chain_in_it():
     assert min((first[met] == kind).sum() for kind in (0, 1)) > 500
 
 
+def test_box__of_a_world_in_which_a_touch_pushes_first():
+    """Vehicle 2 drives away from a touching Vehicle 3, brakes, and strikes Vehicle 1; then Vehicle 3 strikes it.
+
+    This is the first impact of the two: no push, although 4.8 m/s of its closing speed come from the brakes.
+    """
+    state = three(
+        [44.75, 0], [0, 20, 20], [2, 8, 8], [0, 0, 2.5], drive=[0, 3, 0], mass=[1, 10, 1], limit=60, restitution=0.1
+    )
+    plan = np.repeat([0.0, 3.0, 0.0, -8.0, 0.0, -8.0], [1, 8, 4, 9, 1, 1])
+    (first,), (box,), (cost,) = chains_of(state, plan[np.newaxis])
+    assert first == 1 and box[HARD] <= TOUCH_MPS and box[SOFT_2] == pytest.approx(15.2, abs=0.1)
+    assert cost - 20 < chain_cost(first, row.rows_of(state, 2, STEP_S)[0], box, HORIZON_S) <= cost
+
+
 # First contact at once, at 20 m/s; another after 1 s. Touches push with 48e-5 m/s; half of it moves each of the pair.
 TOUCHED = {  # world in which the place of the second contact is ``way`` ahead; how far that can be
     "behind": (lambda way: at(GAP_L=way, V_L=0, A_L=5, V_F=20, V_R=20, LIMIT_F=40), REAR_FIRST, 20.00024),
