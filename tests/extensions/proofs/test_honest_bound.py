@@ -13,7 +13,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.resimulation import advance_worlds
 from ethbrake_marl.extensions.proofs import line as row
 from ethbrake_marl.extensions.proofs.avoidability import FRONT, avoidability
-from ethbrake_marl.extensions.proofs.chain_search import triple_contact
+from ethbrake_marl.extensions.proofs.chain_search import first_boxes, triple_contact
 from ethbrake_marl.extensions.proofs.chains import (
     BOX_ROWS,
     EARLY,
@@ -225,6 +225,16 @@ def test_most_push__is_the_inverse_of_the_price(cost):
     world = at(BOUNCE=0.1)
     for touch, closing in ((False, 1.0), (True, 0.5 * TOUCH_MPS)):
         assert price_of(world, most_push(world, touch, cost), closing) == pytest.approx(cost, rel=1e-12)
+
+
+def test_first_boxes__contain_each_push_that_costs_at_most_the_best():
+    """900 m2/s2 are the price of 90 m/s; after a touch an impact of 5.5 m/s changes 6.05 m/s for 30.25 of them."""
+    state = three([44.75, 0.01], [0, 20, 20], [2, 8, 8], [0, 0, 2.5], drive=[0, 3, 0], mass=[1, 10, 1], restitution=0.1)
+    boxes, box = np.empty((BOX_ROWS, 64)), np.empty(BOX_ROWS)
+    count = first_boxes(REAR_FIRST, row.rows_of(state, 2, STEP_S)[0], 0.1, 0.9, True, 900.0, HORIZON_S, boxes, box)
+    touches = boxes[HARD, :count] <= TOUCH_MPS
+    assert {*boxes[MOST_PUSH, :count][touches].round(9)} == {93.025}
+    assert {*boxes[MOST_PUSH, :count][~touches].round(9)} == {90.0}
 
 
 @pytest.mark.nightly
