@@ -1,6 +1,6 @@
 """Research environment for ethical emergency braking: exact physics of several vehicles, and a shield that bounds harm.
 
-Importing the package registers ``EthBrake-v2`` with Gymnasium, and ``ethbrake/ethbrake-v2`` with PettingZoo (from
+Importing the package registers ``EthBrake-v3`` with Gymnasium, and ``ethbrake/ethbrake-v3`` with PettingZoo (from
 version 1.27 on). A public name is imported when it is first used, so torch and matplotlib are loaded only if needed.
 """
 
@@ -98,7 +98,7 @@ if TYPE_CHECKING:
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError, MissingExtra as MissingExtra
 
-__version__ = "2.0.0"
+__version__ = "3.0.0.dev0"
 
 
 _HOMES = names_behind(__file__)

@@ -128,7 +128,7 @@ import ethbrake_marl
 from ethbrake_marl.cli.app import run_command
 assert "gymnasium" not in sys.modules
 {use}
-assert "EthBrake-v2" in sys.modules["gymnasium"].registry
+assert "EthBrake-v3" in sys.modules["gymnasium"].registry
 from ethbrake_marl.{load}
 try:
     load(name)

@@ -81,7 +81,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 
     """
 
-    metadata: Any = Metadata(name="ethbrake_v2", is_parallelizable=True)
+    metadata: Any = Metadata(name="ethbrake_v3", is_parallelizable=True)
 
     def __init__(
         self,

@@ -23,7 +23,7 @@ from ethbrake_marl.worlds.open_game import AnyScenario
 
 
 class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
-    """Many worlds, each as in ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v2", num_envs=4096)``).
+    """Many worlds, each as in ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v3", num_envs=4096)``).
 
     Row k begins with world k of the seed; every later episode, in any row, takes the next world.
 

@@ -87,7 +87,8 @@ The same keys after a reset and after every step:
 
 ## Versions
 
-`EthBrake-v2`: [what has changed](../../CHANGELOG.md). `EthBrake-v1`: in version 1.0 of this package.
+`EthBrake-v3`: [what has changed](../../CHANGELOG.md). `EthBrake-v2`: in version 2.0 of this package;
+`EthBrake-v1`: in version 1.0.
 """
 
 
