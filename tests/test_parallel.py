@@ -4,6 +4,7 @@ import os
 
 import pytest
 
+from ethbrake_marl import parallel
 from ethbrake_marl.parallel import WorkerLost, run_each
 
 

@@ -11,7 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.foreign import Ask, ask_function, ask_of, check_wrappers, count_of_actions, features_of
+from ethbrake_marl.agents.foreign import (
+    Ask,
+    ask_function,
+    ask_of,
+    check_gamma,
+    check_wrappers,
+    count_of_actions,
+    features_of,
+)
 from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
 from ethbrake_marl.episode.counts import COUNTS, HarmCount
 from ethbrake_marl.episode.features import GROUPS
@@ -225,8 +233,8 @@ def policy_agent(
         actions: number of discrete actions, evenly spaced from -1 to 1, if the policy returns indices.
         ignore_wrappers: accept a model whose training environment has wrappers that may change observations or actions.
 
-    Raises ``InvalidInput`` for an unknown kind of policy, and if observations or actions would differ from its
-    training.
+    Raises ``InvalidInput`` for an unknown kind of policy, if observations or actions would differ from its training,
+    and if a model's discount was too large for the shaping of its reward (``episode.shaping``).
 
     >>> import ethbrake_marl as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
@@ -245,6 +253,7 @@ def policy_agent(
             f"{who}: initial_state = {initial_state!r:.60}: must be a function, number of episodes -> memory, for a"
             " function (observation, state) -> (action, state); write one around another kind of model"
         )
+    check_gamma(policy, who)
     if not ignore_wrappers:
         check_wrappers(policy, who)
         actions = count_of_actions(policy, actions, who)

@@ -67,7 +67,7 @@ def experiment_command(
         if recipe is None and len(chosen.learners) > 1:
             plan = load_recipe(quickest(several=True))
             changes = read_settings(settings, [*type(plan).model_fields])
-        plan = change_recipe(plan, changes.recipe, out)
+        plan = change_recipe(plan, changes.recipe)
         folder = output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed)
         check_new_run(folder.expanduser(), force=force)
         from ethbrake_marl.training.experiment import (  # torch takes seconds to load

@@ -97,7 +97,7 @@ def train_command(
         plan = load_recipe(recipe or "ppo")
         changes = read_settings(settings, [*type(plan).model_fields])
         chosen = changes.change_scenario(scenario or plan.scenario or "paper-random")
-        plan = change_recipe(plan, changes.recipe, out)
+        plan = change_recipe(plan, changes.recipe)
         begun = [Training.of(plan, chosen).who_drives()]
         folder = output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed)
         check_new_run(folder.expanduser(), force=force)
@@ -120,25 +120,11 @@ def run_folder(scenario: str, recipe: str, scheme: str | None, seed: int) -> Pat
     return Path("runs") / f"{scenario}-{plan}-seed{seed}"
 
 
-def change_recipe(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
-    """Recipe ``plan`` with the settings ``overrides`` of the command line.
-
-    Prints a note if the discount ``gamma`` then differs from the discount of reward shaping.
-    """
+def change_recipe(plan: TrainingRecipe, overrides: Any) -> TrainingRecipe:
+    """Recipe ``plan`` with the settings ``overrides`` of the command line."""
     from ethbrake_marl.files.overrides import Override
 
-    if not overrides:
-        return plan
-    new = plan.replace(**Override.put(plan.model_dump(mode="json"), overrides))
-    together = {"gamma": new.gamma, "reward.shaping_discount": new.reward.shaping_discount}
-    set_here = [key for key in together if key in {override.key for override in overrides}]
-    if len(set_here) == 1 and len({*together.values()}) > 1:
-        (key,), (second,) = set_here, together.keys() - set(set_here)
-        out.note(
-            f"note: {key} = {together[key]:g} differs from {second} = {together[second]:g}. Reward shaping then changes"
-            f" which policy is best; make both equal (--set {second}={together[key]:g})"
-        )
-    return new
+    return plan.replace(**Override.put(plan.model_dump(mode="json"), overrides)) if overrides else plan
 
 
 def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> None:
@@ -149,6 +135,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     from ethbrake_marl.cli.settings import read_settings
     from ethbrake_marl.episode.counts import HONEST, IMPACT_COUNTS
     from ethbrake_marl.files.plain import read_object
+    from ethbrake_marl.files.python_file import loaded_files
     from ethbrake_marl.training.fixed_list import OBJECTIVE_METRIC, full_braking
 
     training, plan = result.training, result.training.recipe
@@ -175,7 +162,8 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     options = [setting for setting in settings if read_settings([setting], [*type(plan).model_fields]).scenario]
     options += [f"harm_count={count.name}"] * (count != HONEST)
     place = training.lines[0].scenario.name if training.scenario.lines else scenario or training.scenario.name
-    words = ["--scenario", place, "--agents", f"full_brake,{result.agent}"]
+    words = [word for file in loaded_files() for word in ("--load", file)]
+    words += ["--scenario", place, "--agents", f"full_brake,{result.agent}"]
     command = shlex.join(
         ["ethbrake", "evaluate", *words, *(word for setting in options for word in ("--set", setting))]
     )

@@ -126,7 +126,7 @@ def lists_by_body(columns: dict[str, Any], bodies: Ints) -> dict[str, list[Any]]
     The columns of worlds come first, then those of vehicles.
     """
     lists = {name: value.repeat(len(bodies)).tolist() for name, value in columns.items() if value.ndim == 1}
-    of_vehicles = {name: value[:, bodies - 1] for name, value in columns.items() if value.ndim == 2}
+    of_vehicles = {name: value.take(bodies - 1, axis=1) for name, value in columns.items() if value.ndim == 2}
     return lists | {name: value.reshape(-1).tolist() for name, value in of_vehicles.items()}
 
 

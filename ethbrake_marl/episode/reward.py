@@ -21,12 +21,12 @@ from pydantic import (
 
 from ethbrake_marl.episode.counts import ALL_IMPACTS, COUNTS, FIRST_IMPACTS, HONEST, HarmCount
 from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of, parse_objective
+from ethbrake_marl.episode.shaping import Shaping
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import SAFE_END, Step, StepSettings
 from ethbrake_marl.episode.terms import (
     BUILT_IN,
     TERMS,
-    Shaping,
     TermFunction,
     collision,
     component,
@@ -77,7 +77,7 @@ class RewardParams(FileModel):
         harm_count: what the term harm counts: ``honest``, ``first`` or ``total`` (``episode.counts``).
         objective: objective of all vehicles, or a list with one per vehicle; None: as in the scenario.
         collision, risk, jerk, terminal, push, drove, still_moving, shaping: weights of these terms (``episode.terms``).
-        shaping_discount: discount in the term shaping, in (0, 1]; use the discount of your training.
+        shaping_discount: discount in the term shaping, in (0, 1]; the learner's may not be larger (``check_gamma``).
         k_energy: factor of the term collision, or a list with one for each pair of vehicles, front to rear.
         ttc_scale_s: tau of the term risk, s.
         safety_buffer_m: d_safe of the term risk, m.
@@ -168,12 +168,27 @@ class RewardParams(FileModel):
         require(self.objective is None or self.harm > 0.0, ("objective",), UNSHOWN, right)
         return self
 
+    def right_gamma(self, gamma: float) -> str:
+        """What the discount ``gamma`` of a learner must be, if it is too large for the shaping; otherwise empty."""
+        if self.shaping == 0.0 or gamma <= self.shaping_discount:
+            return ""
+        return (
+            f"must be at most {self.shaping_discount:g}, the reward's shaping_discount: a larger discount of the"
+            " learner pays for states of large predicted harm"
+        )
+
+    def check_gamma(self, gamma: float, what: str) -> None:
+        """Raise ``InvalidInput`` if the discount ``gamma`` of a learner is too large; ``what`` begins the message."""
+        if right := self.right_gamma(gamma):
+            raise InvalidInput(f"{what} = {gamma:g}: {right}")
+
     @property
     def weights(self) -> dict[str, float]:
         return {**{name: getattr(self, name) for name in BUILT_IN}, **self.terms}
 
 
 REWARDS = {
+    "shaped": RewardParams(harm=0.05, shaping=0.05),
     "honest": RewardParams(),
     "harm": RewardParams(harm_count=FIRST_IMPACTS),
     "total-harm": RewardParams(harm_count=ALL_IMPACTS),
@@ -295,17 +310,18 @@ class Rewarding(NamedTuple):
         """The state ``after`` with the reward's new memory, and the step with the complete reward."""
         values = {name: function(before, step, after) for name, _, function in self.terms}
         if self.shaping is not None:
-            values["shaping"], memory = self.shaping.value(before, step, after)
-            after = after._replace(memories={**after.memories, "shaping": memory})
+            values["shaping"], memory = self.shaping.value(before, after)
+            after = State(*after[:5], {**after.memories, "shaping": memory})
         extra = np.zeros(step.reward.shape)
         for name, weight, _ in self.terms:
             if weight:
                 extra += weight * _wide(values[name])
         if self.params.shaping:
             extra += self.params.shaping * values["shaping"]
-        extra[before.ended] = 0.0
+        if self.terms:
+            extra[before.ended] = 0.0
         reward_terms = {**self.shared(step), **values}
-        step = step._replace(reward=step.reward + extra, terms=reward_terms)
+        step = Step(step.reward + extra, step.out, step.time_step_s, reward_terms)
         if self.components:
             step = step._replace(terms={name: reward_terms[name] for name in reward_terms if name in self.reported})
             vector = np.stack(
@@ -317,8 +333,10 @@ class Rewarding(NamedTuple):
 
     def shared(self, step: Step) -> dict[str, Floats]:
         """Values of the terms that the compiled step computes, name -> [n]."""
-        names = [name for name in ("harm", "terminal") if name in self.reported]
-        return {name: -step.cost if name == "harm" else step.out[SAFE_END] for name in names}
+        values = {"harm": -step.cost} if "harm" in self.reported else {}
+        if "terminal" in self.reported:
+            values["terminal"] = step.out[SAFE_END]
+        return values
 
 
 def _wide(value: Floats) -> Floats:

@@ -14,7 +14,7 @@ push          minus the push of all contacts of the line (``motion.push``)
 drove         minus the speed that the vehicle's engine alone gives it (``motion.forces.driving``)
 still_moving  -1 if the episode ends at the horizon with a vehicle in motion
 shaping       for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
-              the learners can reach. It leaves the optimal policy unchanged (Ng, Harada and Russell 1999)
+              the learners can reach (``episode.shaping``)
 harm_K        minus the harm that vehicle_K bears
 pair_J_K      minus the harm of the pair of vehicle_J and vehicle_K behind it
 obstacle      minus the harm of impacts with the obstacle
@@ -32,20 +32,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import COUNTED_ROWS, HarmCount, pair_amounts
+from ethbrake_marl.episode.counts import HarmCount, pair_amounts
 from ethbrake_marl.episode.functions import call_function, check_finite_values, description_of
-from ethbrake_marl.episode.hold import descend
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
-from ethbrake_marl.episode.state import END, State, require
-from ethbrake_marl.episode.step import TRUNCATED, Step, StepSettings
+from ethbrake_marl.episode.state import State, require
+from ethbrake_marl.episode.step import TRUNCATED, Step
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
 from ethbrake_marl.motion.layout import DROVE, PUSHED, TOTAL, Floats
 from ethbrake_marl.registry import Registry
 
 TermFunction = Callable[[State, Step, State], Floats]
-
-BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
 
 
 class Term(NamedTuple):
@@ -159,41 +156,6 @@ def still_moving(before: State, step: Step, after: State) -> Floats:
     """Term still_moving, [n]: -1 if the step ends at the horizon with a vehicle in motion, otherwise 0."""
     require(before, "the term still_moving", simulates=True)
     return 0.0 - step.out[TRUNCATED] * after.moving
-
-
-def potential(settings: StepSettings, state: State) -> Floats:
-    """Minus the least further harm that constant decelerations of the learners can reach, [n] m2/s2.
-
-    The learners choose in turn, front to rear, among nine shares of their braking capacity (several learners: in two
-    rounds); all other vehicles brake fully. Harm is counted as in the reward. The potential of an episode that has
-    ended is 0.
-    """
-    learners = settings.learners.tolist()
-    # With one learner only the least harm counts: full braking comes first, which often does no more harm.
-    shares, rounds = (BRAKING_SHARES[::-1], 1) if len(learners) == 1 else (BRAKING_SHARES, 2)
-    line = state.line.copy()
-    line[:, COUNTED_ROWS] = 0.0
-    state = state._replace(line=line)
-    _, least = descend(state, learners, shares, rounds, state.clock[:, END], settings.harm_count)
-    least[state.ended] = 0.0
-    return -least
-
-
-class Shaping(NamedTuple):
-    """The term shaping. Its memory is the potential of the present state, [n] m2/s2."""
-
-    settings: StepSettings
-    discount: float
-
-    def begin(self, state: State) -> Floats:
-        return potential(self.settings, state)
-
-    def value(self, before: State, step: Step, after: State) -> tuple[Floats, Floats]:
-        """Value of the term, [n, N] m2/s2, and the new memory, [n] m2/s2."""
-        new = potential(self.settings, after)
-        value = np.zeros((after.n, after.vehicles))
-        value[:, self.settings.learners - 1] = (self.discount * new - before.memories["shaping"])[:, np.newaxis]
-        return value, new
 
 
 def growth(objectives: Sequence[Objective], count: HarmCount, before: State, step: Step, after: State) -> Floats:

@@ -169,7 +169,7 @@ def _of_file(file: str, name: str) -> Measure:
     It may be a function that the file itself registers under this name, also as a term of a reward.
     """
     value = load_from_file(file, name)
-    if name in TERMS and TERMS[name].value is value:
+    if name in TERMS and TERMS[name].function is value:
         return _sum_of_term(name, TERMS[name].value, TERMS[name].unit)
     if name in MEASURES and value in (MEASURES[name].of, MEASURES[name].watch):
         return MEASURES[name]

@@ -93,7 +93,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
         scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str] | None = None,
-        reward: Any = "honest",
+        reward: Any = "shaped",
         observation: Any = None,
         actions: int | None = None,
         reward_vector: Any = None,

@@ -63,8 +63,8 @@ def shield(
     is_agent = hasattr(env, "act")
     if not is_agent and not isinstance(env, Team) and not hasattr(env, "unwrapped"):
         raise InvalidInput(
-            f"shield: {env!r:.80}: is neither an environment nor an agent or a team; make an agent of a network or"
-            " another policy: eb.shield(eb.policy_agent(policy, scenario=...), scenario=...)"
+            f"shield: {env!r:.80}: must be a team, an agent, or an environment; make an agent of a network or another"
+            " policy: eb.shield(eb.policy_agent(policy, scenario=...), scenario=...)"
         )
     if is_agent == (scenario is None):
         right = "pass scenario=..., in which it drives" if is_agent else "leave out scenario"

@@ -55,7 +55,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str] | None = None,
-        reward: Any = "honest",
+        reward: Any = "shaped",
         observation: Any = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,

@@ -30,6 +30,11 @@ def load_file(path: str) -> None:
     PREPARATIONS[whole_path] = (run_file, whole_path)
 
 
+def loaded_files() -> list[str]:
+    """Paths of the files of ``load_file``."""
+    return [path for path, (function, *_) in PREPARATIONS.items() if function is run_file]
+
+
 def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
     """Object ``name`` that a Python file defines (``run_file``).
 

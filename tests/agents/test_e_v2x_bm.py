@@ -181,10 +181,10 @@ def test_pairwise__refuses_what_the_proof_excludes():
     worlds = wide(3, 3, seed=1)
     backward = worlds.line.copy()
     backward[2, SPEED, 1] = -0.1
-    with pytest.raises(InvalidInput, match=r"^e_v2x_bm:pairwise: a vehicle moves backward in row 2, where the closed"):
+    with pytest.raises(InvalidInput, match=r"^e_v2x_bm:pairwise does not cover backward, by which world 2 departs"):
         pairwise(worlds._replace(line=backward), 2)
     slow = alert([9.0], [20.0, 20.0], brake_rate_mps3=[np.inf, 12.0])
-    with pytest.raises(InvalidInput, match=r"^e_v2x_bm:pairwise: brakes build up gradually in row 0, where the closed"):
+    with pytest.raises(InvalidInput, match=r"^e_v2x_bm:pairwise does not cover build-up, by which world 0 departs"):
         pairwise(slow, 1)
 
 

@@ -346,6 +346,26 @@ def test_wrappers_that_change_nothing__are_let_through() -> None:
     assert harms(policy_agent(trained)) == harms(policy_agent(partial(predicted, trained)))
 
 
+UNDER: dict[str, Callable[[Any], Any]] = {
+    "VecEnv": lambda reward: vec_env.VecMonitor(rows(reward=reward)),
+    "Gymnasium": lambda reward: OwnEnv(reward=reward),
+}
+
+
+@pytest.mark.parametrize("name", UNDER)
+def test_discount_above_that_of_the_shaping__is_refused(name: str) -> None:
+    def driven(gamma: float, reward: Any) -> Any:
+        env = UNDER[name](reward)
+        model = stable.PPO("MlpPolicy", env, n_steps=4, batch_size=4, gamma=gamma, policy_kwargs=dict(TINY))
+        return policy_agent(model, ignore_wrappers=True)
+
+    early = {"harm": 1.0, "shaping": 0.1, "shaping_discount": 0.95}
+    for gamma, reward in ((1.0, "shaped"), (0.95, early), (1.0, {**early, "shaping": 0.0})):
+        assert driven(gamma, reward).name == "PPO"
+    with refused("agent 'PPO': the model was trained with gamma = 0.99: must be at most 0.95, the reward's shaping_d"):
+        driven(0.99, early)
+
+
 @pytest.mark.parametrize("algorithm", [stable.PPO, stable.SAC])
 def test_model_from_a_file__needs_the_statistics_it_was_trained_under(algorithm: Any, tmp_path: Path) -> None:
     kind = {"n_steps": 32} if algorithm is stable.PPO else {"learning_starts": 8, "buffer_size": 100}

@@ -57,8 +57,8 @@ to `front_64` and `rear_2` to `rear_64` are vehicles farther away. More numbers,
 
 ## Reward
 
-By default `r = - sum w^2` for every vehicle, over the first impacts of all pairs in the step, with the
-closing speed `w` in m/s. In general `r = sum weight x term`:
+The discount of a training must be at most the reward's `shaping_discount` (DISCOUNT by default;
+[why](../environments.md#rewards)). `r = sum weight x term`; the default is `shaped`:
 
 {rewards}
 
@@ -66,7 +66,7 @@ closing speed `w` in m/s. In general `r = sum weight x term`:
 
 [Counts of harm](../game.md#three-counts-of-harm). Rewards are large before a policy has learned
 anything (honest cost of random actions on `paper-random`: about 550 m²/s² an episode; full braking:
-31), so most learners need a scale, for instance `reward={{"harm": 0.05, "harm_count": "honest"}}`.
+31), so most learners need the scale of `shaped`.
 
 ## Start and end
 

@@ -16,9 +16,10 @@ from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.reward import REWARDS, Rewarding, RewardParams, WithoutEffect, reward_params
+from ethbrake_marl.episode.shaping import potential
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import COST, Step
-from ethbrake_marl.episode.terms import potential, register_term
+from ethbrake_marl.episode.terms import register_term
 from ethbrake_marl.errors import FreeImpacts, InvalidInput
 from ethbrake_marl.motion.layout import BRAKING, FIRST, GAP, SPEED, TOTAL
 from ethbrake_marl.worlds.catalogue import load_scenario

@@ -82,10 +82,11 @@ def test_step__moves_no_world_if_the_action_of_another_slice_is_bad() -> None:
     assert_same(state[:5], before[:5])
 
 
-def test_step__names_the_world_of_any_slice_that_failed() -> None:
-    game = game_with(2)
-    state = planted(game.reset(game.draw(N, 5, 10)))
-    with pytest.raises(PhysicsError, match=r"^world 13: "):
+@pytest.mark.parametrize("row", [3, 100, N - 1])
+def test_step__names_the_world_of_any_slice_that_failed(row: int) -> None:
+    game = game_with(3)
+    state = planted(game.reset(game.draw(N, 5, 10)), row)
+    with pytest.raises(PhysicsError, match=rf"^world {10 + row}: "):
         game.step(state, np.zeros((N, 1)))
 
 

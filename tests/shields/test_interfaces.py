@@ -139,7 +139,7 @@ def test_policies_propose_what_the_caller_leaves_out() -> None:
 @pytest.mark.parametrize("policy", [None, "ppo"])
 def test_the_bound_holds_where_the_next_step_begins_the_next_episode(policy: Any) -> None:
     """Gymnasium's default: the step after an episode's last one reports the bound of the next one."""
-    env = shield(EthBrakeVectorEnv(8, "paper-random"), policy)
+    env = shield(EthBrakeVectorEnv(8, "paper-random", reward="harm"), policy)
     first, over, episodes = env.reset(seed=1)[1]["shield_bound_harm"].copy(), np.zeros(8, bool), 0
     for _ in range(120):
         *_, ended, cut, infos = env.step(np.full((8, 1), 1.0 if policy is None else np.nan))
@@ -151,7 +151,7 @@ def test_the_bound_holds_where_the_next_step_begins_the_next_episode(policy: Any
 
 
 def test_mode_episode() -> None:
-    env = shield(EthBrakeEnv("paper-random"), "full_brake", "episode", bound="pairwise")
+    env = shield(EthBrakeEnv("paper-random", reward="harm"), "full_brake", "episode", bound="pairwise")
     env.reset(seed=7)
     info = env.step([0.0])[4]
     names = {"chosen_policy", "policy_harm", "bound_harm", "proposed_action", "applied_action", "intervened"}
@@ -174,7 +174,7 @@ def test_teams_and_names() -> None:
 def test_the_count__is_that_of_the_reward_unless_it_is_given() -> None:
     for env, count in (
         (EthBrakeEnv("paper-random"), HONEST),
-        (EthBrakeEnv("paper-random", reward={"harm": 1.0, "harm_count": "first"}), FIRST_IMPACTS),
+        (EthBrakeEnv("paper-random", reward="harm"), FIRST_IMPACTS),
     ):
         assert shield(env).unwrapped.game.shield.harm_count == count
         assert shield(env, "ppo", "episode").unwrapped.game.shield.harm_count == count
@@ -192,7 +192,7 @@ def test_a_shield_that_is_registered_for_names_is_a_mode() -> None:
 
 @pytest.mark.parametrize("named", [{}, {"scenario": "paper-random"}], ids=str)
 def test_a_network__is_refused_with_the_name_of_the_function_that_makes_it_an_agent(named: dict[str, str]) -> None:
-    with pytest.raises(InvalidInput, match=r"nor an agent or a team; make an agent of .* eb.shield\(eb.policy_agent\("):
+    with pytest.raises(InvalidInput, match=r"must be a team, .* make an agent of .* eb.shield\(eb.policy_agent\("):
         shield(lambda seen: seen[:, :1], **named)
 
 

@@ -96,7 +96,7 @@ def test_report__gets_the_measures_that_there_are_and_writes_into_the_run(tmp_pa
     assert (found.measures, tables, where) == (("pushed_mps",), ["table"], "there")
     assert found.compared.result.about["seed"] == 3 and "mine.txt" in status(run)["written"]
     (said,) = filter(None, notes)
-    assert said.startswith("e_v2x_bm:pairwise is left out: e_v2x_bm:pairwise: brakes build up gradually")
+    assert said.startswith("e_v2x_bm:pairwise is left out: e_v2x_bm:pairwise does not cover build-up")
 
 
 def test_evaluation__that_is_interrupted_keeps_the_policy_and_says_so(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         scenario: must have a learner; all its learners must observe the same features.
         n: number of worlds.
         seed: seed of the worlds.
-        reward: a name such as ``honest``, or the weights of the reward's terms.
+        reward: a name such as ``shaped``, or the weights of the reward's terms.
         horizon_is_end: True: an episode that reaches the horizon is terminated; False: it is truncated.
         shield: mode of the learners' shield, such as ``step``. None: no shield.
         actions: number of discrete actions, for algorithms such as QMIX; None: actions are numbers in [-1, 1].
@@ -59,7 +59,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         scenario: AnyScenario,
         n: int,
         seed: int,
-        reward: Any = "honest",
+        reward: Any = "shaped",
         horizon_is_end: bool = True,
         shield: str | None = None,
         actions: int | None = None,

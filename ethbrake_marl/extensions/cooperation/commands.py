@@ -100,7 +100,7 @@ def ablate_command(
             raise InvalidInput("--sweep is given twice; give it once, because the figures can show only one swept key")
         loaded = [load_recipe(name.strip()) for name in recipes.split(",")]
         changes = read_settings(settings, [key for recipe in loaded for key in type(recipe).model_fields])
-        changed_recipes = [change_recipe(recipe, changes.recipe, out) for recipe in loaded]
+        changed_recipes = [change_recipe(recipe, changes.recipe) for recipe in loaded]
         changed_recipes = [recipe if recipe.scheme else recipe.replace(scheme="shared") for recipe in changed_recipes]
         usual = ",".join(STANDARD) if sweep is None else SWEEP_LEVEL
         names = [name.strip() for name in (levels or usual).split(",")]

@@ -84,8 +84,8 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "key 'kept' of v2x: the name of its memory, 'shield', is in use; choose": lambda: register_v2x_key(
         "kept", UsersKey("shield", Mine())
     ),
-    "key 'kept' of v2x: the name of its memory, 'physics', is in use": lambda: register_v2x_key(
-        "kept", UsersKey("physics", Mine())
+    "key 'kept' of v2x: the name of its memory, 'departures', is in use": lambda: register_v2x_key(
+        "kept", UsersKey("departures", Mine())
     ),
 }  # fmt: skip
 
