@@ -27,7 +27,6 @@ def test_process__that_is_killed_is_an_error_and_each_has_one_thread() -> None:
         list(run_each([(os._exit, 3)], 2))
 
 
-
 @pytest.mark.parametrize(("cores", "jobs", "processes", "share"), [(5, 2, 2, 2), (3, 8, 3, 1), (2, 2, 2, 1)])
 def test_processes_and_their_threads__are_never_more_than_the_cores(
     cores: int, jobs: int, processes: int, share: int, monkeypatch: pytest.MonkeyPatch

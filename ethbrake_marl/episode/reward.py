@@ -166,7 +166,7 @@ class RewardParams(FileModel):
 
 
 REWARDS = {
-    "shaped": RewardParams(harm=0.05, harm_count="honest", shaping=0.05),
+    "shaped": RewardParams(harm=0.05, harm_count="honest", shaping=0.05, shaping_discount=0.99),
     "harm": RewardParams(),
     "total-harm": RewardParams(harm_count="total"),
     "honest": RewardParams(harm_count="honest"),
