@@ -7,11 +7,11 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import teams_of
-from ethbrake_marl.episode.counts import IMPACT_COUNTS
+from ethbrake_marl.episode.counts import FIRST_IMPACTS, IMPACT_COUNTS
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.measures import Measure
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.report.best_known import AVOIDABLE_COLUMN, BEST, UNAVOIDABLE
+from ethbrake_marl.extensions.report.best_known import AVOIDABLE_COLUMN, UNAVOIDABLE
 
 AGENTS = ("full_brake", "constant:4.5", "ppo", "ppo+episode")
 
@@ -28,9 +28,9 @@ def with_best_known(compared: Comparison) -> Comparison:
     least = {
         count: 0.5 * np.min([own[count.column] for own in result.columns.values()], axis=0) for count in IMPACT_COUNTS
     }
-    more = {BEST[count]: value for count, value in least.items()}
-    more[AVOIDABLE_COLUMN] = least["first"] == 0.0
-    more[UNAVOIDABLE] = least["first"] > 0.0
+    more = {f"best_known_{count.name}": value for count, value in least.items()}
+    more[AVOIDABLE_COLUMN] = least[FIRST_IMPACTS] == 0.0
+    more[UNAVOIDABLE] = least[FIRST_IMPACTS] > 0.0
     columns = {agent: {**own, **more} for agent, own in result.columns.items()}
     searched = replace(
         result,
