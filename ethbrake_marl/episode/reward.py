@@ -55,7 +55,7 @@ Count = Annotated[  # in files the name of a count
     PlainValidator(_count),
     PlainSerializer(lambda count: count.name),
     WithJsonSchema({"type": "string"}),
-    Field(json_schema_extra=lambda schema: schema.update(enum=[*COUNTS])),
+    Field(json_schema_extra=lambda schema: schema.update(enum=[*COUNTS], default=HONEST.name)),
 ]
 Omitted = Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)]  # in files only if it is not 0
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -91,7 +91,7 @@ class RewardParams(FileModel):
     """
 
     harm: NonNegative = 1.0
-    harm_count: Count = HONEST
+    harm_count: Count = Field(default_factory=lambda: HONEST)  # a plain default cannot stand in a JSON Schema
     objective: str | Annotated[tuple[str, ...], Field(strict=False)] | None = None
     collision: NonNegative = 0.0
     risk: NonNegative = 0.0
