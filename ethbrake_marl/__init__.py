@@ -1,6 +1,6 @@
 """Research environment for ethical emergency braking: exact physics of several vehicles, and a shield that bounds harm.
 
-Importing the package registers ``EthBrake-v2`` with Gymnasium, and ``ethbrake/ethbrake-v2`` with PettingZoo (from
+Importing the package registers ``EthBrake-v3`` with Gymnasium, and ``ethbrake/ethbrake-v3`` with PettingZoo (from
 version 1.27 on). A public name is imported when it is first used, so torch and matplotlib are loaded only if needed.
 """
 
@@ -78,6 +78,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.agent_names import register_agent as register_agent, register_shield as register_shield
     from ethbrake_marl.evaluation.measure_registry import register_measure as register_measure
     from ethbrake_marl.episode.terms import register_term as register_term
+    from ethbrake_marl.episode.counts import HarmCount as HarmCount, register_count as register_count
     from ethbrake_marl.training.recipe import register_algorithm as register_algorithm
     from ethbrake_marl.episode.objectives import register_objective as register_objective
     from ethbrake_marl.episode.features import (
@@ -97,7 +98,7 @@ if TYPE_CHECKING:
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError, MissingExtra as MissingExtra
 
-__version__ = "2.0.0"
+__version__ = "3.0.0.dev0"
 
 
 _HOMES = names_behind(__file__)

@@ -22,7 +22,7 @@ from itertools import product
 from typing import Any
 
 from ethbrake_marl.agents.team import Agent, Team, check_agent, check_knows
-from ethbrake_marl.episode.counts import check_count
+from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game, Script
 from ethbrake_marl.episode.layer import UNSTATED
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, UnknownName, describe_error
@@ -56,7 +56,7 @@ class AgentSettings:
     spec: str  # as the user has written it
     policy: str | None = None  # path after the @
     scenario: Scenario | None = None  # in which the agent drives; None: not known
-    harm_count: str = "first"  # what optimising agents minimise (``episode.counts``)
+    harm_count: HarmCount = HONEST  # what optimising agents minimise
     options: Mapping[str, Any] = field(default_factory=dict)  # of ``eb.shield``; a name has none
 
     def needed_scenario(self) -> Scenario:
@@ -133,7 +133,7 @@ AGENTS: Registry[AgentEntry] = Registry("agent", "agents", register_agent)
 WRAPPERS: Registry[AgentEntry] = Registry("shield or search", "shields", register_shield)
 
 
-def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:
+def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: AnyCount = HONEST) -> Driver:
     """Agent or team for a name such as ``"constant:3.5"`` or ``"ppo+step"`` (syntax: top of this file).
 
     Teams, wrappers and agents that look ahead need ``scenario``. ``harm_count``: harm that optimising agents minimise
@@ -145,13 +145,12 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
     'constant:3.5'
 
     """
-    check_count("harm_count", harm_count)
     loaded = None if scenario is None else load_scenario(scenario)
     if not isinstance(spec, str) or not spec:
         raise InvalidInput(f"agent {spec!r:.80}: must be a name, for instance full_brake, policy@runs/mine or ppo+step")
     split_specs(spec)
     core, *wrappers = spec.split("+")
-    settings = AgentSettings(core, None, loaded, harm_count)
+    settings = AgentSettings(core, None, loaded, HarmCount.of(harm_count))
     driver = _make(core, settings)
     for wrapper in wrappers:
         settings = replace(settings, spec=f"{settings.spec}+{wrapper}")
@@ -172,7 +171,7 @@ def team_of(driver: Driver, scenario: Scenario) -> Team:
     return Team(driver.name, dict.fromkeys(scenario.learners, driver))
 
 
-def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
+def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: AnyCount = HONEST) -> dict[str, Team]:
     """Team of each spec: spec -> team. A group of agents is replaced by its specs.
 
     ``specs``: a list, or a text with commas. Raises the errors of ``make_agent``, and ``InvalidInput`` for a repeated
@@ -187,7 +186,7 @@ def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: st
     return teams
 
 
-def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
+def teams_of(agents: Any, scenario: Scenario, *, harm_count: AnyCount = HONEST) -> dict[str, Team]:
     """Teams for any description of agents: name -> team.
 
     ``agents`` is a text or list as in ``make_teams``; or a mapping from names to specs, agents, teams, or mappings from
@@ -216,7 +215,7 @@ def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> d
     return teams
 
 
-def _driver(agent: Any, scenario: Scenario, harm_count: str) -> Any:
+def _driver(agent: Any, scenario: Scenario, harm_count: AnyCount) -> Any:
     return make_agent(agent, scenario=scenario, harm_count=harm_count) if isinstance(agent, str) else agent
 
 
@@ -326,7 +325,7 @@ def _call_maker(spec: str, make: Callable[..., Any], *arguments: Any) -> Any:
 def open_game(
     scenario: AnyScenario,
     learners: Iterable[str] | None = None,
-    reward: Any = "harm",
+    reward: Any = "honest",
     observation: Any = None,
     reward_vector: Any = None,
     report: Sequence[str] = (),

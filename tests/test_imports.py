@@ -107,31 +107,34 @@ def test_start__version_every_help_and_completion_import_nothing_heavy() -> None
     assert "Train a policy, or the policies of several learners." in out
 
 
-@pytest.mark.parametrize("use", ["ethbrake_marl.Scenario", "run_command(['scenario', 'show', 'paper-random'])"])
-def test_start__environments_are_registered_by_what_is_more_than_help(use: str) -> None:
+@pytest.mark.parametrize(
+    ("use", "load", "hint"),
+    [
+        (
+            "ethbrake_marl.Scenario",
+            "training.recipe import load_recipe as load; name = 'step'",
+            "'step' names another kind: shield or search",
+        ),
+        (
+            "run_command(['scenario', 'show', 'paper-random'])",
+            "worlds.catalogue import load_scenario as load; name = 'universal+step'",
+            "'universal' names another kind: agent",
+        ),
+    ],
+)
+def test_first_use__registers_environments_and_a_hint_knows_names_of_every_kind(use: str, load: str, hint: str) -> None:
     program = f"""
 import ethbrake_marl
 from ethbrake_marl.cli.app import run_command
 assert "gymnasium" not in sys.modules
 {use}
-assert "EthBrake-v2" in sys.modules["gymnasium"].registry
+assert "EthBrake-v3" in sys.modules["gymnasium"].registry
+from ethbrake_marl.{load}
+try:
+    load(name)
+except ValueError as error:
+    print(error)
 """
-    status, _, err = ended(program)
-    assert (status, err) == (0, "")
-
-
-@pytest.mark.parametrize(
-    ("use", "hint"),
-    [
-        (
-            "worlds.catalogue import load_scenario as load; name = 'universal+step'",
-            "'universal' names another kind: agent",
-        ),
-        ("training.recipe import load_recipe as load; name = 'step'", "'step' names another kind: shield or search"),
-    ],
-)
-def test_unknown_name__hint_is_the_same_whatever_was_imported_before(use: str, hint: str) -> None:
-    program = f"from ethbrake_marl.{use}\ntry:\n    load(name)\nexcept ValueError as error:\n    print(error)"
     status, out, err = ended(program)
     assert (status, err) == (0, "") and hint in out
 

@@ -1,7 +1,7 @@
 """Independent PPO (IPPO) for several learners, in PettingZoo and torch. Read it from top to bottom.
 
     python train/ippo.py --scenario cooperation-3-pair --output runs/ippo
-    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@runs/ippo --set rules=honest
+    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@runs/ippo
 
 Each learner has its own actor, critic and optimiser, and the other learners are part of its environment. All learners
 learn at the same time, from the same episodes. Letters: T time steps, C copies, F features.

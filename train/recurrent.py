@@ -2,7 +2,7 @@
 
     ethbrake scenario new lossy --based-on cooperation-3-pair     # then: v2x: {preset: blocked, persistence: periodic}
     python train/recurrent.py --scenario lossy.yaml --output gru
-    ethbrake evaluate --scenario lossy.yaml --agents full_brake,train/recurrent.py:make_agent:gru --set rules=honest
+    ethbrake evaluate --scenario lossy.yaml --agents full_brake,train/recurrent.py:make_agent:gru
 
 Information about other vehicles grows old between two messages. A memory can use earlier observations, too. The
 training is a plain policy gradient on whole episodes, on arrays of all learners (docs/environments.md).

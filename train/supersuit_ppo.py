@@ -1,7 +1,7 @@
 """Several learners share one policy: PettingZoo, SuperSuit and Stable-Baselines3's PPO. Read it from top to bottom.
 
     python train/supersuit_ppo.py --scenario cooperation-3-pair --steps 200000 --output runs/supersuit
-    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,ppo@runs/supersuit --set rules=honest
+    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,ppo@runs/supersuit
 
 `ethbrake train --set scheme=shared` trains the same policy many times faster, and can resume after a crash. This file
 is for programs that use PettingZoo. SuperSuit 3.11 has four pitfalls; comments with the word "trap" say how each is

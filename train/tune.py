@@ -3,7 +3,7 @@
     python train/tune.py --scenario paper-random --recipe ppo --search n_epochs=1..4 gamma=0.99/1.0 --output runs/tuning
 
 A trial is one training run, and its harm is the harm of its saved policy in the worlds of the recipe's evaluation, as
-the reward counts it: the honest cost, or first-impact harm with ``--set rules=paper``.
+the reward counts it: the honest cost, or first-impact harm with ``--set harm_count=first``.
 ``--jobs`` trials are proposed together, then trained at the same time. After an interruption, start the same command
 again: it keeps the trials in ``optuna.log``, and has the same result. A larger number of ``--trials`` adds trials.
 """

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agent_names import make_teams, open_game
-from ethbrake_marl.episode.counts import COUNTS, HARM
+from ethbrake_marl.episode.counts import COUNTS, HARM, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, PhysicsError
@@ -128,7 +128,7 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
     harm, profiles = dict(table.harm), dict(table.profiles)
     for count in known.harm if known is not None else ():
         if count not in harm:  # stays as it was
-            harm[count], profiles[count] = known.stored(problem_of(game, alert), count)
+            harm[count], profiles[count] = known.stored(problem_of(game, alert), HarmCount.of(count))
     return BestHarmTable(table.identity, harm, profiles, header)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import COUNTS
+from ethbrake_marl.episode.counts import COUNTS, HarmCount
 from ethbrake_marl.extensions.report.style import finish, in_our_style, new_panels, series_style, write_picture
 from ethbrake_marl.extensions.search.best_harm import e_v2x_bm_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, problem_of
@@ -65,7 +65,7 @@ def costs_of(test: str) -> list[Cost]:
     scenario, game = eb.open_game(test)
     alert = scenario.sample(WORLDS, SEED)
     asked = problem_of(game, alert, count="total")
-    shipped = {price: best_stored(asked, count)[1] for price, count in SHIPPED.items()}
+    shipped = {price: best_stored(asked, HarmCount.of(count))[1] for price, count in SHIPPED.items()}
     found = [Cost.of("full_brake", 0.0, asked.follow(asked.constant(asked.bounds[:, np.newaxis, :, 0])))]
     for price in PRICES:
         problem = with_price(asked, price)

@@ -150,7 +150,7 @@ def stepping(n: int, steps: int = 100) -> Work:
 
 def vec_env(n: int, steps: int = 100) -> Work:
     """Steps of the Stable-Baselines3 ``VecEnv``: the engine's step, infos, and automatic new episodes."""
-    environment = eb.make_sb3_vec_env(SCENARIO, n, seed=SEED)  # imports torch, hence only now
+    environment = eb.make_sb3_vec_env(SCENARIO, n, seed=SEED, reward="honest")  # imports torch, hence only now
     environment.reset()
     actions = np.full((n, 1), -SHARE, np.float32)
 
@@ -164,7 +164,7 @@ def vec_env(n: int, steps: int = 100) -> Work:
 
 def parallel(n: int, episodes: int = 20) -> Work:
     """Whole episodes of one world (``n`` is 1) with PettingZoo's parallel API, including resets."""
-    environment = eb.parallel_env(SCENARIO, agents="learners")
+    environment = eb.parallel_env(SCENARIO, agents="learners", reward="honest")
     actions = {name: np.array([-SHARE], np.float32) for name in environment.possible_agents}
     environment.reset(seed=SEED)
 
@@ -217,7 +217,7 @@ def brake_apart(speeds, ways, steps):
 
 _START = """
 import ethbrake_marl
-environment = ethbrake_marl.parallel_env()
+environment = ethbrake_marl.parallel_env(reward="honest")
 environment.reset(seed=7)
 environment.step({"vehicle_2": [-1.0]})
 """

@@ -14,6 +14,7 @@ import numpy as np
 
 from ethbrake_marl.agents.pairwise import ConstantDeceleration, closed_form, pairwise
 from ethbrake_marl.agents.team import NO_BODIES, PREDICTED
+from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.layer import MODEL, STATE
 from ethbrake_marl.episode.state import State
@@ -31,15 +32,17 @@ LEAST_GAIN = 1e-3  # a gain in harm (m2/s2) too small to search for
 TIE_MARGIN = 1e-9  # harms (m2/s2) closer than this count as equal
 
 
-def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Floats = 8.0) -> ConstantDeceleration:
+def coupled(
+    alert: State, body: int, harm_count: AnyCount = HONEST, horizon_s: float | Floats = 8.0
+) -> ConstantDeceleration:
     """Constant deceleration of vehicle ``body`` that does the least simulated harm, and this harm, in every world.
 
-    All other vehicles hold ``alert.wanted``. ``count``: harm to minimise (``episode.counts``). ``horizon_s``: time
+    All other vehicles hold ``alert.wanted``. ``harm_count``: harm to minimise (``episode.counts``). ``horizon_s``: time
     until which harm counts, one number or [n]. Ties: the closed form's deceleration if it does no harm; then the harm
-    in a second count (``counts.other_count``); then the middle one. Harm has kinks and jumps, so a deceleration between
-    two samples may do less.
+    in a second count (``HarmCount.tie_breaker``); then the middle one. Harm has kinks and jumps, so a deceleration
+    between two samples may do less.
     """
-    until_s = np.full(alert.n, horizon_s, np.float64)
+    count, until_s = HarmCount.of(harm_count), np.full(alert.n, horizon_s, np.float64)
     braking = np.maximum(-alert.wanted, 0.0)
     braking[:, body] = alert.braking_capacity_mps2[:, body - 1]
     best = closed_form(alert, braking, body).deceleration_mps2
@@ -53,7 +56,7 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
     return ConstantDeceleration(best, harm[0])
 
 
-def harms(alert: State, body: int, decelerations: Floats, count: str, until_s: Floats) -> Floats:
+def harms(alert: State, body: int, decelerations: Floats, count: HarmCount, until_s: Floats) -> Floats:
     """Harm if vehicle ``body`` holds each of C ``decelerations`` [n, C] (m/s2), [2, n, C] m2/s2.
 
     Row 0 is the harm in ``count``, row 1 the harm in the count that breaks ties.
@@ -61,7 +64,7 @@ def harms(alert: State, body: int, decelerations: Floats, count: str, until_s: F
     return hold(alert, alert.wanted, [body], -decelerations[:, :, np.newaxis], until_s, count)
 
 
-def search_deceleration(alert: State, body: int, count: str, until_s: Floats) -> Floats:
+def search_deceleration(alert: State, body: int, count: HarmCount, until_s: Floats) -> Floats:
     """Best constant deceleration of vehicle ``body`` (m/s2), with its harm as in ``harms`` (m2/s2), [n, 3].
 
     Divides the range into ``FIRST_PARTS`` cells, then again and again every cell that may contain a better
@@ -160,9 +163,9 @@ class EV2XBM(Predicting):
     name, knows = "e_v2x_bm", MODEL
 
     def __init__(
-        self, settings: StepSettings, agents: Mapping[int, str] = MappingProxyType({}), count: str = "first"
+        self, settings: StepSettings, agents: Mapping[int, str] = MappingProxyType({}), harm_count: AnyCount = HONEST
     ) -> None:
-        self.settings, self.agents, self.count = settings, dict(agents), count
+        self.settings, self.agents, self.harm_count = settings, dict(agents), HarmCount.of(harm_count)
 
     def begin(self, alert: State, body: int) -> BaselineMemory:
         """Command for the whole episode, and its predicted harm. Raises ``InvalidInput`` if another vehicle is in
@@ -177,9 +180,9 @@ class EV2XBM(Predicting):
         wanted, learners = alert.wanted.copy(), self.settings.learners
         wanted[:, learners] = -alert.braking_capacity_mps2[:, learners - 1]
         alert = alert._replace(wanted=wanted)
-        command = -coupled(alert, body, self.count, self.settings.horizon_s).deceleration_mps2
+        command = -coupled(alert, body, self.harm_count, self.settings.horizon_s).deceleration_mps2
         wanted[:, body] = command
-        return BaselineMemory(command, last_if_held(alert, self.settings).harm(self.count))
+        return BaselineMemory(command, last_if_held(alert, self.settings).harm(self.harm_count))
 
     def act(self, state: State, memory: BaselineMemory, body: int) -> tuple[Floats, BaselineMemory]:
         return memory.command, memory
@@ -188,7 +191,7 @@ class EV2XBM(Predicting):
 class EV2XBMPairwise(Predicting):
     """Brakes with the deceleration of ``pairwise``, the paper's closed form."""
 
-    name, knows = "e_v2x_bm:pairwise", STATE
+    name, knows, harm_count = "e_v2x_bm:pairwise", STATE, FIRST_IMPACTS
 
     def begin(self, alert: State, body: int) -> BaselineMemory:
         """Command and predicted harm. Raises ``InvalidInput`` where the closed form does not hold (``pairwise``)."""

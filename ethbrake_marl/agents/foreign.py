@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.policy import Policy
@@ -147,6 +148,15 @@ def check_wrappers(policy: Any, who: str) -> None:
             " model.set_env(VecNormalize.load(PATH, venv)); if VecNormalize changed rewards only, pass"
             " ignore_wrappers=True"
         )
+
+
+def check_gamma(model: Any, who: str) -> None:
+    """Raise ``InvalidInput`` if a model's discount was too large for the reward of its training environment."""
+    env, gamma = getattr(model, "get_env", lambda: None)(), getattr(model, "gamma", None)
+    for layer in [] if env is None else wrappers_of(env):
+        game = getattr(layer, "game", None)
+        if gamma is not None and isinstance(game, Game):
+            game.rewarding.params.check_gamma(gamma, f"{who}: the model was trained with gamma")
 
 
 def wrappers_of(env: Any) -> Iterator[Any]:

@@ -11,8 +11,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.foreign import Ask, ask_function, ask_of, check_wrappers, count_of_actions, features_of
+from ethbrake_marl.agents.foreign import (
+    Ask,
+    ask_function,
+    ask_of,
+    check_gamma,
+    check_wrappers,
+    count_of_actions,
+    features_of,
+)
 from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
+from ethbrake_marl.episode.counts import COUNTS, HarmCount
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
@@ -101,6 +110,13 @@ class LearnedAgent(RangeObserver):
     @property
     def training_range(self) -> TrainingRange | None:
         return self.policy.manifest.training_range
+
+    @property
+    def trained_for(self) -> HarmCount | None:
+        """Count of harm that the training minimised; None without harm in its reward, or for an unknown count."""
+        reward = self.policy.manifest.reward
+        name = reward.get("harm_count") if reward.get("harm") else None
+        return COUNTS[name] if isinstance(name, str) and name in COUNTS else None
 
     def observe(self, view: View, state: State, body: int) -> Observations:
         return observe_through(self.layers, view, state, body, self.policy.manifest.time_step_s)
@@ -217,8 +233,8 @@ def policy_agent(
         actions: number of discrete actions, evenly spaced from -1 to 1, if the policy returns indices.
         ignore_wrappers: accept a model whose training environment has wrappers that may change observations or actions.
 
-    Raises ``InvalidInput`` for an unknown kind of policy, and if observations or actions would differ from its
-    training.
+    Raises ``InvalidInput`` for an unknown kind of policy, if observations or actions would differ from its training,
+    and if a model's discount was too large for the shaping of its reward (``episode.shaping``).
 
     >>> import ethbrake_marl as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
@@ -237,6 +253,7 @@ def policy_agent(
             f"{who}: initial_state = {initial_state!r:.60}: must be a function, number of episodes -> memory, for a"
             " function (observation, state) -> (action, state); write one around another kind of model"
         )
+    check_gamma(policy, who)
     if not ignore_wrappers:
         check_wrappers(policy, who)
         actions = count_of_actions(policy, actions, who)

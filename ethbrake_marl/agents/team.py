@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ethbrake_marl.episode.commands import actions_of
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.episode.game import Game, Script, Shield
 from ethbrake_marl.episode.layer import KNOWLEDGE, UNSTATED
 from ethbrake_marl.episode.script_calls import UserScript, ask_script, begin_script, guard_scripts, name_of
@@ -76,6 +77,15 @@ class Team(NamedTuple):
             check_agent(agent, f"team {name!r}: {vehicle} = {agent!r:.60}")
             bodies[int(vehicle.removeprefix("vehicle_"))] = agent
         return Team(name, dict(sorted(bodies.items())), shield)
+
+    def remarks(self, count: HarmCount) -> list[str]:
+        """What a table of agents that minimise ``count`` must say of this team: its other counts of harm."""
+        agents = [("minimises", getattr(agent, "harm_count", None)) for agent in self.drivers.values()]
+        agents += [("trained for", getattr(agent, "trained_for", None)) for agent in self.drivers.values()]
+        own = [*agents, ("bounds", getattr(self.shield, "harm_count", None))]
+        return list(
+            dict.fromkeys(f"{verb} {of.words}" for verb, of in own if isinstance(of, HarmCount) and of != count)
+        )
 
     def game(self, game: Game) -> Game:
         """The game with this team's shield.

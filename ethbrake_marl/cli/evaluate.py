@@ -60,11 +60,10 @@ def evaluate_command(
 
     `ethbrake agent list` shows all agents; the name ladder is short for those that need no training, from bad to good.
     A name can be followed by a shield, +episode or +step; for instance full_brake+step or policy@PATH+step, where PATH
-    is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
-    total harm instead of first-impact harm; with --set rules=honest, total harm and a price for pushes, for driving and
-    for motion at the horizon. --set measures=pushed_mps,pushed_m adds measures to the
-    results. --scenario benchmark evaluates the tasks of the benchmark, and the name of a task only this task; there,
-    agents minimise the honest cost.
+    is the folder of a run or of a policy bundle. Agents minimise the honest cost; with --set harm_count=first,
+    first-impact harm, as in the paper; with harm_count=total, total harm. --set measures=pushed_mps,pushed_m adds
+    measures to the results. --scenario benchmark evaluates the tasks of the benchmark, and the name of a task only this
+    task.
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.cli.settings import read_settings
@@ -105,16 +104,16 @@ def _compare(
     is_benchmark: bool,
 ) -> Comparison:  # fmt: skip
     from ethbrake_marl.agent_names import teams_of
-    from ethbrake_marl.evaluation.benchmark import COUNT, benchmark_measures
+    from ethbrake_marl.episode.counts import HONEST, HarmCount
+    from ethbrake_marl.evaluation.benchmark import benchmark_measures
     from ethbrake_marl.evaluation.comparison import Comparison
 
     loaded = chosen.change_scenario(scenario)
-    harm_count = chosen.command.get("harm_count", COUNT if is_benchmark else "first")
-    measures = chosen.command.get("measures", "")
+    count, measures = HarmCount.of(chosen.command.get("harm_count", HONEST)), chosen.command.get("measures", "")
     if is_benchmark:
         measures = ",".join(filter(None, [measures, *benchmark_measures(loaded, episodes=episodes, seed=seed)]))
     return Comparison.of(
-        loaded, teams_of(agents, loaded, harm_count=harm_count), episodes=episodes, seed=seed, harm_count=harm_count,
+        loaded, teams_of(agents, loaded, harm_count=count), episodes=episodes, seed=seed, harm_count=count,
         measures=measures, jobs=jobs or 1, on_done=lambda worlds: out.progress("worlds", worlds, episodes),
     )  # fmt: skip
 

@@ -50,13 +50,12 @@ def experiment_command(
     (mixture-three-tests). The policy is compared in the scenario, or in the first one of a recipe's mixture; if it is
     one of the three tests (paper-random, paper-random-brake-only, paper-random-obstacle), also in the other two. For a
     team, the report also shows the harm that each vehicle bears, and what each learner adds. All agents minimise the
-    honest cost; with --set rules=paper, first-impact harm, for which pushing is free. Ctrl-C ends the training early
-    and evaluates the policy trained so far; a second Ctrl-C stops at once.
+    honest cost; with --set harm_count=first, first-impact harm, for which pushing is free. Ctrl-C ends the training
+    early and evaluates the policy trained so far; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_TRAINING) as out:
         from ethbrake_marl.agent_names import require_learner
         from ethbrake_marl.cli.settings import read_settings
-        from ethbrake_marl.episode.counts import IN_WORDS
         from ethbrake_marl.training.recipe import load_recipe
         from ethbrake_marl.training.training import check_new_run
 
@@ -68,7 +67,7 @@ def experiment_command(
         if recipe is None and len(chosen.learners) > 1:
             plan = load_recipe(quickest(several=True))
             changes = read_settings(settings, [*type(plan).model_fields])
-        plan = change_recipe(plan, changes.recipe, out)
+        plan = change_recipe(plan, changes.recipe)
         folder = output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed)
         check_new_run(folder.expanduser(), force=force)
         from ethbrake_marl.training.experiment import (  # torch takes seconds to load
@@ -95,7 +94,7 @@ def experiment_command(
         )
         trained = experiment.trained
         objective = trained.training.objective
-        single, harm = experiment.learned == POLICY, IN_WORDS[plan.reward.harm_count]
+        single, harm = experiment.learned == POLICY, plan.reward.harm_count.words
         headline = (
             f"Trained on {trained.training.scenario.name} by recipe {plan.name}, seed {trained.training.recipe.seed}:"
             f" {trained.steps:,} decisions in {trained.wall_s:.0f} s ({trained.status})."

@@ -95,6 +95,8 @@ def _trial_content(scenario: Scenario, trial: Trial) -> dict[str, Any]:
 
 def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
     """Lines about a scenario's trial, for the user."""
+    from ethbrake_marl.episode.counts import HarmCount
+
     n, ranges = trial.drawn.worlds.n, _ranges(trial)
     learners = ", ".join(trial.known) or "none"
     yield f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; tried in {n} worlds"
@@ -124,12 +126,13 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
         knowledge = ", ".join(f"{name} in {100.0 * share:.1f} %" for name, share in shares.items())
         yield from _fold(f"{learner} knows when it can first act: {knowledge} of the worlds", 4)
     for what, harm in trial.harm.items():
-        yield f"mean harm, {what}: {harm['first']:.2f} (first impacts), {harm['total']:.2f} (all impacts)"
+        means = ", ".join(f"{HarmCount.of(name).words} {mean:.2f}" for name, mean in harm.items())
+        yield from _fold(f"means, {what}: {means}", 3)
     for spec, why in trial.refused.items():
         yield from _fold(f"{spec} cannot drive here: {why}", 3)
-    first = [harm["first"] for harm in trial.harm.values()]
-    if len(first) > 1 and first[0] - min(first) <= 0.02 * first[0]:
-        yield "there is hardly anything to learn: nothing that was tried does less than 98 % of full braking's harm"
+    costs = [harm[trial.harm_count.name] for harm in trial.harm.values()]
+    if len(costs) > 1 and costs[0] - min(costs) <= 0.02 * costs[0]:
+        yield f"there is hardly anything to learn: nothing tried saves 2 % of full braking's {trial.harm_count.words}"
 
 
 def _ranges(trial: Trial) -> dict[str, dict[str, float]]:
@@ -188,21 +191,25 @@ def scenario_parts(as_json: JsonOption = False) -> None:
     Lists features of observations, V2X presets, objectives, terms of rewards, measures beside the usual ones, training
     algorithms and recipes.
     """
+    from ethbrake_marl.episode.counts import COUNTS
     from ethbrake_marl.episode.features import FEATURES, GROUPS, WHOLE_GROUPS
     from ethbrake_marl.episode.objectives import OBJECTIVES
     from ethbrake_marl.episode.terms import BUILT_IN, TERMS
-    from ethbrake_marl.evaluation.measure_registry import DEFAULT_MEASURES, MEASURES
+    from ethbrake_marl.evaluation.measure_registry import MEASURES
+    from ethbrake_marl.evaluation.measures import DEFAULT
     from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
     from ethbrake_marl.worlds.channel import PRESETS
 
     features = FEATURES.usable().items()
+    usual = {measure.name for measure in DEFAULT}
     feature_names = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
     parts = {
         "Observation": [*WHOLE_GROUPS, "front_K", "rear_K", *GROUPS, *feature_names],
         "V2X presets": [*PRESETS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
         "Terms": [*BUILT_IN, *TERMS],
-        "Measures": [name for name in MEASURES if name not in DEFAULT_MEASURES],
+        "Counts of harm": [*COUNTS],
+        "Measures": [name for name in MEASURES if name not in usual],
         "Algorithms": [*ALGORITHMS],
         "Recipes": [*usable_recipes()],
     }

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ethbrake_marl.episode.counts import SHORT_NAMES
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.overrides import Override
-from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -48,13 +46,14 @@ def read_settings(
     """
     valid_keys = {"scenario": {*Scenario.model_fields} - NO_SETTING, "recipe": {*recipe_keys} - NO_SETTING}
     valid_keys["command"] = {*of_command}
-    valid_keys["command"] |= {"rules"} if recipe_keys or "harm_count" in of_command else set()
     by_owner: dict[str, list[Override]] = {owner: [] for owner in valid_keys}
     overrides = Override.parse(texts or ())
     for override in overrides:
-        if override.key == "rules" and "rules" in valid_keys["command"]:
-            owner = "recipe" if recipe_keys else "command"
-            by_owner[owner].append(_expand_rules(override, overrides, owner))
+        if override.key == "rules" and (recipe_keys or "harm_count" in of_command):
+            name = "first" if override.value == "paper" else "honest"
+            raise InvalidInput(f"--set {override.text}: rules has ended; write --set harm_count={name}")
+        if override.key == "harm_count" and recipe_keys:
+            by_owner["recipe"].append(_of_reward(override, overrides))
             continue
         named = override.top in ("scenario", "recipe") and len(override.path) > 1
         if named and override.top == "recipe" and not recipe_keys:
@@ -73,19 +72,15 @@ def read_settings(
     return CommandSettings(tuple(texts or ()), by_owner["scenario"], by_owner["recipe"], command)
 
 
-def _expand_rules(rules: Override, overrides: Sequence[Override], owner: str) -> Override:
-    """The setting that ``rules=NAME`` abbreviates: ``reward.harm_count`` of a recipe, else ``harm_count``.
+def _of_reward(count: Override, overrides: Sequence[Override]) -> Override:
+    """The setting ``reward.harm_count`` of a recipe, for which ``harm_count`` is short.
 
-    ``owner``: what the setting changes, such as ``recipe``. Raises ``InvalidInput`` for an unknown NAME, and if one of
-    ``overrides`` changes the same key.
+    Raises ``InvalidInput`` if one of ``overrides`` changes the same key.
     """
-    name, path = rules.value, ("reward", "harm_count") if owner == "recipe" else ("harm_count",)
-    if not isinstance(name, str) or name not in SHORT_NAMES:
-        raise InvalidInput(f"--set rules={flow_text(name, 60)}: must be {' or '.join(SHORT_NAMES)}")
     for override in overrides:
-        inside = override.path[1:] if owner == override.top == "recipe" else override.path
-        if inside and inside == path[: len(inside)]:
+        path = override.path[1:] if override.top == "recipe" else override.path
+        if path in (("reward",), ("reward", "harm_count")):
             raise InvalidInput(
-                f"--set rules: sets {'.'.join(path)}, which --set {override.key} sets, too; leave one of them out"
+                f"--set harm_count: sets reward.harm_count, which --set {override.key} sets, too; leave one of them out"
             )
-    return Override(rules.text, path, SHORT_NAMES[name])
+    return Override(count.text, ("reward", "harm_count"), count.value)

@@ -67,7 +67,7 @@ def train_command(
 ) -> None:
     """Train a policy, or the policies of several learners.
 
-    The recipe says what learners minimise: by default the honest cost; with --set rules=paper, first-impact harm.
+    The recipe says what learners minimise: by default the honest cost; with --set harm_count=first, first-impact harm.
     Writes the folder of the training run. At the end the command prints the harm of the trained agent and of full
     braking, the agent's name, and a command that evaluates the agent. Ctrl-C ends the training after the current update
     and saves the policy. `ethbrake train --resume FOLDER` continues the training; the final policy is then the same,
@@ -97,7 +97,7 @@ def train_command(
         plan = load_recipe(recipe or "ppo")
         changes = read_settings(settings, [*type(plan).model_fields])
         chosen = changes.change_scenario(scenario or plan.scenario or "paper-random")
-        plan = change_recipe(plan, changes.recipe, out)
+        plan = change_recipe(plan, changes.recipe)
         begun = [Training.of(plan, chosen).who_drives()]
         folder = output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed)
         check_new_run(folder.expanduser(), force=force)
@@ -120,25 +120,11 @@ def run_folder(scenario: str, recipe: str, scheme: str | None, seed: int) -> Pat
     return Path("runs") / f"{scenario}-{plan}-seed{seed}"
 
 
-def change_recipe(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
-    """Recipe ``plan`` with the settings ``overrides`` of the command line.
-
-    Prints a note if the discount ``gamma`` then differs from the discount of reward shaping.
-    """
+def change_recipe(plan: TrainingRecipe, overrides: Any) -> TrainingRecipe:
+    """Recipe ``plan`` with the settings ``overrides`` of the command line."""
     from ethbrake_marl.files.overrides import Override
 
-    if not overrides:
-        return plan
-    new = plan.replace(**Override.put(plan.model_dump(mode="json"), overrides))
-    together = {"gamma": new.gamma, "reward.shaping_discount": new.reward.shaping_discount}
-    set_here = [key for key in together if key in {override.key for override in overrides}]
-    if len(set_here) == 1 and len({*together.values()}) > 1:
-        (key,), (second,) = set_here, together.keys() - set(set_here)
-        out.note(
-            f"note: {key} = {together[key]:g} differs from {second} = {together[second]:g}. Reward shaping then changes"
-            f" which policy is best; make both equal (--set {second}={together[key]:g})"
-        )
-    return new
+    return plan.replace(**Override.put(plan.model_dump(mode="json"), overrides)) if overrides else plan
 
 
 def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> None:
@@ -147,7 +133,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     ``scenario``: name or path of the scenario in the printed command; None: the name in the run's folder.
     """
     from ethbrake_marl.cli.settings import read_settings
-    from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
+    from ethbrake_marl.episode.counts import HONEST, IMPACT_COUNTS
     from ethbrake_marl.files.plain import read_object
     from ethbrake_marl.files.python_file import loaded_files
     from ethbrake_marl.training.fixed_list import OBJECTIVE_METRIC, full_braking
@@ -159,9 +145,10 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
         Column("Total harm", "total_harm"),
         Column("Collisions", "collision_rate", digits=1, scale=100.0, unit=" %"),
     ]
-    if (count := plan.reward.harm_count) not in HARM:
-        columns.append(Column(IN_WORDS[count].capitalize(), COLUMN[count]))
-    measured = {"full_brake": full_braking(training)}
+    count, measured = plan.reward.harm_count, {"full_brake": full_braking(training)}
+    for shown in dict.fromkeys([HONEST, count]):
+        if shown not in IMPACT_COUNTS and shown.column in measured["full_brake"]:
+            columns.append(Column(shown.words.capitalize(), shown.column))
     measured[result.agent] = dict(result.metrics or {})
     if OBJECTIVE_METRIC in measured["full_brake"]:
         columns.append(Column("Relative to full braking" if training.scenario.lines else "Objective", OBJECTIVE_METRIC))
@@ -173,7 +160,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     table = Sheet("", columns, rows, note)
     settings = read_object(result.directory / "config.json").get("settings", ())
     options = [setting for setting in settings if read_settings([setting], [*type(plan).model_fields]).scenario]
-    options += {"first": [], "honest": ["rules=honest"]}.get(count, [f"harm_count={count}"])
+    options += [f"harm_count={count.name}"] * (count != HONEST)
     place = training.lines[0].scenario.name if training.scenario.lines else scenario or training.scenario.name
     words = [word for file in loaded_files() for word in ("--load", file)]
     words += ["--scenario", place, "--agents", f"full_brake,{result.agent}"]

@@ -8,6 +8,7 @@ import numpy as np
 
 from ethbrake_marl.agent_names import AGENTS, make_agent, open_game, team_of
 from ethbrake_marl.agents.team import play_to_end
+from ethbrake_marl.episode.counts import ALL_IMPACTS, HONEST, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -26,17 +27,18 @@ class Trial(NamedTuple):
     moving: int  # worlds in which a vehicle still moves at the horizon
     late: int  # worlds in which Vehicle 1, whose braking is the alert, has a latency
     known: dict[str, dict[str, float]]  # learner -> other vehicle -> share of worlds in which it is known in time
-    harm: dict[str, dict[str, float]]  # what drives the learners -> count -> mean harm (m2/s2)
+    harm_count: HarmCount  # what agents minimise: the honest cost, or total harm if the impacts are not exact
+    harm: dict[str, dict[str, float]]  # what drives the learners -> name of a count -> mean harm (m2/s2)
     refused: dict[str, str]  # agents that cannot drive here -> why
 
 
-def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
+def try_scenario(scenario: Scenario) -> Trial:
     """Simulate the first 200 worlds of the evaluation list, once with each agent in ``COMPARED`` driving the learners.
 
-    ``count`` is the harm that ``best constant deceleration`` and ``best known`` minimise. Raises the errors of scripts,
-    which name vehicle, world and time.
+    Raises the errors of scripts, which name vehicle, world and time.
     """
-    loaded, game = open_game(scenario)
+    count = HONEST if scenario.physics is None else ALL_IMPACTS
+    loaded, game = open_game(scenario, reward={"harm_count": count})
     draw = loaded.draw(WORLDS, SEED)
     worlds, first = draw.worlds, game.reset(draw.worlds)
     harm, refused, last = {}, {}, first
@@ -52,7 +54,7 @@ def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
                 refused[spec] = str(error)
                 continue
             last = end_state if spec == "full_brake" else last
-            harm[what] = {harm_count: float(end_state.harm(harm_count).mean()) for harm_count in ("first", "total")}
+            harm[what] = {each.name: float(end_state.harm(each).mean()) for each in end_state.counts}
     if not loaded.learners:
         last = _to_the_end(game, first)
     return Trial(
@@ -61,6 +63,7 @@ def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
         moving=int((last.speeds_mps != 0.0).any(axis=1).sum()),
         late=int((worlds.latency_s[:, 0] > 0.0).sum()),
         known=_known_shares(loaded, first),
+        harm_count=count,
         harm=harm,
         refused=refused,
     )

@@ -6,50 +6,126 @@ total   harm of every impact
 honest  harm of every impact, also where a contact passes it on to another pair, plus a price of conduct: 10 m/s times
         the push, which is closing speed that forces build up and a contact absorbs; 10 m/s times the speed that a
         vehicle's engine gives by driving; ``v^2`` for a vehicle that still moves at v at the horizon, as if it then hit
-        a standing object
+        a standing object. The default everywhere
 ======  ================================================================================================================
 
 All are in m2/s2 and never fall during an episode. Without the price of conduct, the best braking pushes Vehicle 1 away
 (docs/findings.md). The two vehicles of a pair share harm by their masses; each vehicle alone bears the price of its
-push against the vehicle ahead, of its driving and of its motion.
+push against the vehicle ahead, of its driving and of its motion. ``register_count`` adds a count. A ``harm_count`` is a
+name or a ``HarmCount``; the functions that users call turn it into a ``HarmCount``, which is then passed along.
 """
 
 from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.layout import DROVE, FIRST, MOVING, PASSED, PUSHED, TOTAL, Floats
+from ethbrake_marl.registry import Registry
 
 COUNTED_ROWS = [FIRST, TOTAL, PASSED, PUSHED, DROVE, MOVING]  # rows of a line that a count can weigh
 OF_FIRST, OF_TOTAL, OF_PASSED, OF_PUSHED, OF_DROVE, OF_MOVING = range(6)  # places of their weights
-
-COUNTS = {  # name -> weights of these rows
-    "first": np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
-    "total": np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
-    "honest": np.array([0.0, 1.0, 1.0, 10.0, 10.0, 1.0]),
-}
-SHORT_NAMES = {"honest": "honest", "paper": "first"}  # short name -> count
-Count = str | Floats  # the name of a count, or its weights, [6]
-
-HARM = {"first": "first_impact_harm", "total": "total_harm"}  # counts of harm alone -> column of an evaluation
-COLUMN = {**HARM, "honest": "honest_cost"}  # count -> column
-IN_WORDS = {"first": "first-impact harm", "total": "total harm", "honest": "honest cost"}
+EXACT_IMPACTS = "exact impacts"  # gives all rows; another physics gives only FIRST and TOTAL
 
 
-def weights_of(count: Count) -> Floats:
-    return COUNTS[count] if isinstance(count, str) else count
+@dataclass(frozen=True)
+class HarmCount:
+    """A count of harm. Raises ``InvalidInput`` for bad values.
+
+    Args:
+        name: 1 to 32 characters ``a-z``, ``0-9``, ``-``, beginning with a letter.
+        weights: [6], each 0 or more, of first-impact harm, total harm, harm that contacts pass on, pushes (m/s), speed
+            by driving (m/s) and squared speeds at the horizon.
+        column: name of its column in an evaluation, such as ``total_harm``.
+        words: name in tables and messages, such as ``total harm``.
+        requires: ``("exact impacts",)`` if it weighs more than first-impact and total harm.
+
+    >>> import ethbrake_marl as eb
+    >>> pushing = eb.HarmCount("pushing", [0, 1, 0, 5, 0, 0], "pushing_cost", "pushing cost", ("exact impacts",))
+    >>> eb.load_scenario("paper-random").sample(2, seed=7).harm(pushing)
+    array([0., 0.])
+
+    """
+
+    name: str
+    weights: Floats = field(compare=False)
+    column: str
+    words: str
+    requires: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        where = f"count {self.name!r:.60}"
+        for what, text, form in (("name", self.name, "[a-z][a-z0-9-]{0,31}"), ("column", self.column, "[a-z][a-z_]+")):
+            if not isinstance(text, str) or re.fullmatch(form, text) is None:
+                raise InvalidInput(f"{where}: {what} = {text!r:.60}: must have the form {form}")
+        if not isinstance(self.words, str) or not self.words.strip() or not self.words.isprintable():
+            raise InvalidInput(f"{where}: words = {self.words!r:.60}: must be a text on one line")
+        try:
+            weights = np.array(self.weights, np.float64)
+        except (TypeError, ValueError):
+            weights = np.zeros(0)
+        if weights.shape != (len(COUNTED_ROWS),) or not (np.isfinite(weights) & (weights >= 0.0)).all():
+            raise InvalidInput(f"{where}: weights = {self.weights!r:.80}: must be 6 finite numbers, each 0 or more")
+        if self.requires not in ((), (EXACT_IMPACTS,)) or (not self.requires and weights[OF_PASSED:].any()):
+            raise InvalidInput(
+                f"{where}: requires = {self.requires!r:.60}: must be ('{EXACT_IMPACTS}',), or () if only first-impact"
+                " and total harm have a weight"
+            )
+        object.__setattr__(self, "weights", weights)
+
+    @staticmethod
+    def of(harm_count: object, what: str = "harm_count") -> HarmCount:
+        """The count that a caller means by ``harm_count``, a name or a count; the error calls it ``what``."""
+        if isinstance(harm_count, HarmCount):
+            return harm_count
+        if not isinstance(harm_count, str) or harm_count not in COUNTS:
+            *others, last = map(repr, COUNTS)
+            raise InvalidInput(f"{what} = {harm_count!r:.60}: must be {', '.join(others)} or {last}")
+        return COUNTS[harm_count]
+
+    @property
+    def tie_breaker(self) -> HarmCount:
+        """The count that decides between commands of equal harm."""
+        return ALL_IMPACTS if self == FIRST_IMPACTS else FIRST_IMPACTS
 
 
-def check_count(what: str, count: object) -> None:
-    if count not in COUNTS:
-        raise InvalidInput(f"{what} = {count!r}: must be 'first', 'total' or 'honest'")
+FIRST_IMPACTS = HarmCount("first", np.eye(6)[OF_FIRST], "first_impact_harm", "first-impact harm")
+ALL_IMPACTS = HarmCount("total", np.eye(6)[OF_TOTAL], "total_harm", "total harm")
+HONEST = HarmCount("honest", np.array([0.0, 1.0, 1.0, 10.0, 10.0, 1.0]), "honest_cost", "honest cost", (EXACT_IMPACTS,))
+IMPACT_COUNTS = (FIRST_IMPACTS, ALL_IMPACTS)  # counts of harm alone, which tables always show
+BUILT_IN_COUNTS = (*IMPACT_COUNTS, HONEST)
 
 
-def other_count(count: Count) -> str:
-    """The count that breaks ties in ``count``: ``total`` for ``first``, ``first`` for all others."""
-    return "total" if isinstance(count, str) and count == "first" else "first"
+def register_count(
+    name: str, weights: Sequence[float] | Floats, *, column: str, words: str, requires: Sequence[str] = ()
+) -> None:
+    """Register a ``HarmCount`` for rewards, agents, shields, searches and tables.
+
+    Entry points: ``ethbrake_marl.counts``. Raises ``AlreadyExists`` for a name in use, and the errors of ``HarmCount``,
+    whose fields the arguments are.
+    """
+    count = HarmCount(name, np.array(weights), column, words, tuple(requires))
+    if column in {other.column for other in COUNTS.loaded.values() if other.name != name}:
+        raise InvalidInput(f"count {name!r}: column = {column!r}: is the column of another count; give another name")
+    COUNTS.add(name, count, lambda known: known == count and np.array_equal(known.weights, weights))
+
+
+COUNTS: Registry[HarmCount] = Registry(
+    "count", "counts", register_count, {count.name: count for count in BUILT_IN_COUNTS}
+)
+
+
+AnyCount = str | HarmCount  # a count, or its name
+
+
+def all_counts(*more: HarmCount) -> list[HarmCount]:
+    """All counts that can be loaded: ``first``, ``total``, ``honest``, registered ones; and ``more``."""
+    return [*dict.fromkeys([*COUNTS.usable().values(), *more])]
 
 
 @kernel
@@ -61,7 +137,7 @@ def unshared_amount(line, p, weights):
 
 @kernel
 def pair_amount(line, p, weights):
-    """Harm of pair ``p`` so far in one world (m2/s2), in the count with these ``weights`` [6], a value of ``COUNTS``.
+    """Harm of pair ``p`` so far in one world (m2/s2), in the count with these ``weights`` [6].
 
     Pair 0 is the obstacle and Vehicle 1. ``line``: [LINE_ROWS, N + 1] (``motion.layout``).
     """
@@ -99,12 +175,12 @@ def _amounts(line, weights, out):
             out[1, k, p] = unshared_amount(line[k], p, weights)
 
 
-def pair_amounts(line: Floats, count: Count) -> Floats:
+def pair_amounts(line: Floats, count: HarmCount) -> Floats:
     """Harm of every pair so far, and the part of it that the rear vehicle bears alone, [2, n, N + 1] m2/s2.
 
     ``line`` is an array of a ``State``. Column 0 is the pair with the obstacle. For one pair: ``pair_amount``,
     ``unshared_amount``.
     """
     out = np.empty((2, len(line), line.shape[2]))
-    _amounts(line, weights_of(count), out)
+    _amounts(line, count.weights, out)
     return out

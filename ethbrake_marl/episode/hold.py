@@ -11,13 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, pair_amount, weights_of
+from ethbrake_marl.episode.counts import AnyCount, HarmCount, amount_so_far, pair_amount
 from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.forces import capacities
+from ethbrake_marl.motion.forces import capacity
 from ethbrake_marl.motion.interval import FAILED, STOPPED, move_line
-from ethbrake_marl.motion.layout import BRAKING, FIRST, NEW_FIRST, NEW_TOTAL, TOTAL, Floats, Ints, scratch_for
+from ethbrake_marl.motion.layout import (
+    BRAKING,
+    FIRST,
+    LINE_ROWS,
+    NEW_FIRST,
+    NEW_TOTAL,
+    TOTAL,
+    Floats,
+    Ints,
+    scratch_for,
+)
 
 
 @large
@@ -118,16 +128,39 @@ def choose_worlds(inputs, weights, best, least):
                 best[k], least[k] = j, largest
 
 
+@large
+def descend_worlds(inputs, shares, rounds, weights, best, least):
+    """Write the commands that ``descend`` chooses to the ``wanted`` of the inputs, and their harm (m2/s2) to ``least``.
+
+    ``inputs``: ``kernel_inputs``, of which the trials, [1, C, 1] for C ``shares``, are working memory, as is ``best``
+    [1].
+    """
+    line, car, wanted, bodies, trials, time, until, memory = inputs
+    for k in range(len(least)):
+        least[k] = 0.0
+        for i in range(wanted.shape[1]):
+            wanted[k, i] = -capacity(car[k], BRAKING, i)
+        for turn in range(rounds * len(bodies)):
+            b = turn % len(bodies)
+            for j in range(len(shares)):
+                trials[0, j, 0] = -capacity(car[k], BRAKING, bodies[b]) * shares[j]
+            best[0], least[k], row = 0, math.inf, slice(k, k + 1)
+            world = line[row], car[row], wanted[row], bodies[b : b + 1], trials, time[row], until[row], memory
+            choose_worlds(world, weights, best, least[row])
+            wanted[k, bodies[b]] = trials[0, best[0], 0]
+
+
 def hold(
-    state: State, wanted: Floats, bodies: Sequence[int], trials: Floats, until_s: float | Floats, count: Count
+    state: State, wanted: Floats, bodies: Sequence[int], trials: Floats, until_s: float | Floats, harm_count: AnyCount
 ) -> Floats:
     """Harm if ``bodies`` hold constant commands until ``until_s`` (one time or [n]), [2, n, C] m2/s2.
 
-    The first row is the harm in ``count``, the second the harm in the count that breaks ties. ``trials`` [n, C, B] are
-    C sets of commands for the B bodies (m/s2); all other bodies hold ``wanted`` [n, N + 1] (m/s2).
+    The first row is the harm in ``harm_count``, the second the harm in the count that breaks ties. ``trials`` [n, C, B]
+    are C sets of commands for the B bodies (m/s2); all other bodies hold ``wanted`` [n, N + 1] (m/s2).
     """
-    out, weights = np.empty((2, *trials.shape[:2])), (weights_of(count), weights_of(other_count(count)))
-    hold_worlds(kernel_inputs(state, wanted, bodies, trials, until_s), *weights, out)
+    count, out = HarmCount.of(harm_count), np.empty((2, *trials.shape[:2]))
+    inputs = kernel_inputs(state, wanted, bodies, trials, until_s)
+    hold_worlds(inputs, count.weights, count.tie_breaker.weights, out)
     return out
 
 
@@ -137,7 +170,7 @@ def choose(
     bodies: Sequence[int] | Ints,
     trials: Floats,
     until_s: float | Floats,
-    count: Count,
+    count: HarmCount,
     below: Floats,
 ) -> tuple[Ints, Floats]:
     """Number of the first trial with the least harm, [n], and this harm, [n] m2/s2.
@@ -147,7 +180,7 @@ def choose(
     harm over these states counts.
     """
     best, least = np.zeros(len(below), np.int64), below.copy()
-    choose_worlds(kernel_inputs(state, wanted, bodies, trials, until_s), weights_of(count), best, least)
+    choose_worlds(kernel_inputs(state, wanted, bodies, trials, until_s), count.weights, best, least)
     return best, least
 
 
@@ -160,16 +193,20 @@ def kernel_inputs(
     ``wanted``, from ``time`` to ``until`` (s, [n] each). ``line``, ``car`` and ``wanted`` are arrays of a ``State``.
     ``memory`` is working memory: scratch of the physics, one line, and the commands of this line.
     """
-    features = "e_v2x_bm other than pairwise, shields other than episode:pairwise, shaping"
+    features = "e_v2x_bm other than pairwise, shields other than episode:pairwise"
     require(state, f"a plan of constant commands ({features})", simulates=True)
     until, bodies = np.full(state.n, until_s, np.float64), np.asarray(bodies, np.int64)
-    memory = scratch_for(wanted.shape[1]), np.zeros(state.line.shape[1:]), np.zeros(wanted.shape[1])
     time, trials = state.time_s.copy(), np.ascontiguousarray(trials)
-    return state.line, state.car, wanted, bodies, trials, time, until, memory
+    return state.line, state.car, wanted, bodies, trials, time, until, memory_for(wanted.shape[1])
+
+
+def memory_for(bodies: int) -> tuple[Floats, Floats, Floats]:
+    """Working memory of the kernels for lines of this number of ``bodies``: the last entry of ``kernel_inputs``."""
+    return scratch_for(bodies), np.zeros((LINE_ROWS, bodies)), np.zeros(bodies)
 
 
 def descend(
-    state: State, bodies: Sequence[int], shares: Floats, rounds: int, until_s: float | Floats, count: Count
+    state: State, bodies: Sequence[int], shares: Floats, rounds: int, until_s: float | Floats, count: HarmCount
 ) -> tuple[Floats, Floats]:
     """Choose a constant share of the brakes for each of ``bodies``, by coordinate descent; all others brake fully.
 
@@ -177,12 +214,7 @@ def descend(
     1]) for the others' latest choice. Commands are held until ``until_s``. Returns the commands of all bodies, [n, N +
     1] m/s2, and the harm of the episode, [n] m2/s2.
     """
-    braking = capacities(state.car, BRAKING)
-    commands, least = -braking, np.zeros(state.n)
-    for body in list(bodies) * rounds:
-        trials = -braking[:, [body]] * shares
-        best, least = choose(
-            state, commands, [body], trials[:, :, np.newaxis], until_s, count, np.full(state.n, np.inf)
-        )
-        commands[:, body] = trials[np.arange(state.n), best]
+    commands, least = np.empty(state.wanted.shape), np.empty(state.n)
+    inputs = kernel_inputs(state, commands, bodies, np.empty((1, len(shares), 1)), until_s)
+    descend_worlds(inputs, shares, rounds, count.weights, np.zeros(1, np.int64), least)
     return commands, least

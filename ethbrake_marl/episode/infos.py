@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.episode.commands import action_of
-from ethbrake_marl.episode.counts import COUNTS, amount_so_far
+from ethbrake_marl.episode.counts import ALL_IMPACTS, FIRST_IMPACTS, amount_so_far
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import FIRST_IN_LIST, NUMBER, TIME, State, split_world
 from ethbrake_marl.episode.step import Step
@@ -37,7 +37,7 @@ from ethbrake_marl.motion.layout import FIRST, FORCE, IMPACTS, MASS, TOTAL, Floa
     TIME_NOW, FORCE_NOW, BORNE_FIRST, BORNE_TOTAL, LINE_FIRST, LINE_TOTAL, COLLIDED, COMMAND, ACTION, LISTED, WORLD,
 ) = range(11)  # fmt: skip
 OUT_ROWS = 11
-FIRST_WEIGHTS, TOTAL_WEIGHTS = COUNTS["first"], COUNTS["total"]
+FIRST_WEIGHTS, TOTAL_WEIGHTS = FIRST_IMPACTS.weights, ALL_IMPACTS.weights
 
 
 @large
@@ -126,7 +126,7 @@ def lists_by_body(columns: dict[str, Any], bodies: Ints) -> dict[str, list[Any]]
     The columns of worlds come first, then those of vehicles.
     """
     lists = {name: value.repeat(len(bodies)).tolist() for name, value in columns.items() if value.ndim == 1}
-    of_vehicles = {name: value[:, bodies - 1] for name, value in columns.items() if value.ndim == 2}
+    of_vehicles = {name: value.take(bodies - 1, axis=1) for name, value in columns.items() if value.ndim == 2}
     return lists | {name: value.reshape(-1).tolist() for name, value in of_vehicles.items()}
 
 

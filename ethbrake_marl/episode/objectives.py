@@ -34,7 +34,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import pair_amounts
+from ethbrake_marl.episode.counts import HarmCount, pair_amounts
 from ethbrake_marl.episode.functions import call_function, description_of
 from ethbrake_marl.episode.state import State, split_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -235,11 +235,11 @@ def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: b
     return [pair for pair in range(0 if obstacle else 1, vehicles) if not counts[pair] and not counts[pair + 1]]
 
 
-def amounts(objectives: Sequence[Objective], before: State | None, after: State, count: str) -> Floats:
+def amounts(objectives: Sequence[Objective], before: State | None, after: State, count: HarmCount) -> Floats:
     """Increase of the amount that each vehicle should minimise, since ``before`` (None: since the alert), [n, N].
 
     A weighted sum is computed from the harm since ``before``; any other objective is the amount after minus the amount
-    before. ``count`` is the name of the count of harm (``episode.counts``).
+    before.
     """
     amounts_after = pair_amounts(after.line, count)
     harm_so_far = Harm.of(amounts_after, after.car)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.episode.commands import write_commands
-from ethbrake_marl.episode.counts import Count, amount_so_far, weights_of
+from ethbrake_marl.episode.counts import AnyCount, HarmCount, amount_so_far
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import ENDED, STEPS, State
 from ethbrake_marl.episode.step import advance
@@ -34,7 +34,9 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, we
         out[k] = harm
 
 
-def follow_plans(game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf) -> tuple[State, Floats]:
+def follow_plans(
+    game: Game, state: State, plans: Floats, count: HarmCount, most: Any = math.inf
+) -> tuple[State, Floats]:
     """Last states of episodes whose learners follow ``plans`` from ``state`` on, and the episodes' harm, [n] m2/s2.
 
     ``plans`` [n, T, L] are the actions of the L learners at the first T decisions of the episode; after these the last
@@ -52,15 +54,15 @@ def follow_plans(game: Game, state: State, plans: Floats, count: Count, most: An
     line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     out, settings = np.empty(len(plans)), game.settings
     play_worlds(
-        line, car, clock, wanted, plans, most, settings.learners, settings.time_step_s, weights_of(count),
+        line, car, clock, wanted, plans, most, settings.learners, settings.time_step_s, count.weights,
         scratch_for(wanted.shape[1]), out,
     )  # fmt: skip
     return State(line, car, clock, know, wanted, memories), out
 
 
-def price(game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf) -> Floats:
+def price(game: Game, state: State, plans: Floats, harm_count: AnyCount, most: Any = math.inf) -> Floats:
     """Harm of every episode, [n] m2/s2, if the learners follow ``plans`` from ``state`` on (see ``follow_plans``).
 
     An episode stops when its harm is above ``most`` (m2/s2); the result is then its harm so far.
     """
-    return follow_plans(game, state, plans, count, most)[1]
+    return follow_plans(game, state, plans, HarmCount.of(harm_count), most)[1]

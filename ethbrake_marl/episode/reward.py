@@ -6,19 +6,27 @@ import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from operator import not_
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidationError,
+    WithJsonSchema,
+    field_validator,
+    model_validator,
+)
 
-from ethbrake_marl.episode.counts import COUNTS
+from ethbrake_marl.episode.counts import ALL_IMPACTS, COUNTS, FIRST_IMPACTS, HONEST, HarmCount
 from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of, parse_objective
+from ethbrake_marl.episode.shaping import Shaping
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import SAFE_END, Step, StepSettings
 from ethbrake_marl.episode.terms import (
     BUILT_IN,
     TERMS,
-    Shaping,
     TermFunction,
     collision,
     component,
@@ -30,11 +38,25 @@ from ethbrake_marl.episode.terms import (
     risk,
     still_moving,
 )
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput, UnknownName, unknown_name
 from ethbrake_marl.files.model import UNSHOWN, FileModel, NonNegative, Positive, first_mistake, require
 from ethbrake_marl.motion.layout import Floats, Ints
 
-HarmCount = Literal["first", "total", "honest"]
+
+def _count(value: Any) -> HarmCount:
+    try:
+        return HarmCount.of(value, "")
+    except InvalidInput as error:
+        raise ValueError(str(error).rpartition(": ")[2]) from None
+
+
+Count = Annotated[  # in files the name of a count
+    HarmCount,
+    PlainValidator(_count),
+    PlainSerializer(lambda count: count.name),
+    WithJsonSchema({"type": "string"}),
+    Field(json_schema_extra=lambda schema: schema.update(enum=[*COUNTS])),
+]
 Omitted = Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)]  # in files only if it is not 0
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -52,10 +74,10 @@ class RewardParams(FileModel):
 
     Args:
         harm: weight of the term harm. Required if you give any other weight.
-        harm_count: what the term harm counts: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        harm_count: what the term harm counts: ``honest``, ``first`` or ``total`` (``episode.counts``).
         objective: objective of all vehicles, or a list with one per vehicle; None: as in the scenario.
         collision, risk, jerk, terminal, push, drove, still_moving, shaping: weights of these terms (``episode.terms``).
-        shaping_discount: discount in the term shaping, in (0, 1]; use the discount of your training.
+        shaping_discount: discount in the term shaping, in (0, 1]; the learner's may not be larger (``check_gamma``).
         k_energy: factor of the term collision, or a list with one for each pair of vehicles, front to rear.
         ttc_scale_s: tau of the term risk, s.
         safety_buffer_m: d_safe of the term risk, m.
@@ -69,7 +91,7 @@ class RewardParams(FileModel):
     """
 
     harm: NonNegative = 1.0
-    harm_count: HarmCount = "first"
+    harm_count: Count = HONEST
     objective: str | Annotated[tuple[str, ...], Field(strict=False)] | None = None
     collision: NonNegative = 0.0
     risk: NonNegative = 0.0
@@ -146,16 +168,31 @@ class RewardParams(FileModel):
         require(self.objective is None or self.harm > 0.0, ("objective",), UNSHOWN, right)
         return self
 
+    def right_gamma(self, gamma: float) -> str:
+        """What the discount ``gamma`` of a learner must be, if it is too large for the shaping; otherwise empty."""
+        if self.shaping == 0.0 or gamma <= self.shaping_discount:
+            return ""
+        return (
+            f"must be at most {self.shaping_discount:g}, the reward's shaping_discount: a larger discount of the"
+            " learner pays for states of large predicted harm"
+        )
+
+    def check_gamma(self, gamma: float, what: str) -> None:
+        """Raise ``InvalidInput`` if the discount ``gamma`` of a learner is too large; ``what`` begins the message."""
+        if right := self.right_gamma(gamma):
+            raise InvalidInput(f"{what} = {gamma:g}: {right}")
+
     @property
     def weights(self) -> dict[str, float]:
         return {**{name: getattr(self, name) for name in BUILT_IN}, **self.terms}
 
 
 REWARDS = {
-    "harm": RewardParams(),
-    "total-harm": RewardParams(harm_count="total"),
-    "honest": RewardParams(harm_count="honest"),
-    "paper": RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
+    "shaped": RewardParams(harm=0.05, shaping=0.05, shaping_discount=0.99),
+    "honest": RewardParams(),
+    "harm": RewardParams(harm_count=FIRST_IMPACTS),
+    "total-harm": RewardParams(harm_count=ALL_IMPACTS),
+    "paper-reward": RewardParams(harm=0.0, harm_count=FIRST_IMPACTS, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
 }
 Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
 
@@ -165,6 +202,8 @@ def reward_params(reward: Reward) -> RewardParams:
     if isinstance(reward, RewardParams):
         return reward
     if isinstance(reward, str):
+        if reward == "paper":
+            raise UnknownName("reward 'paper' has ended; write paper-reward for its four terms, or harm for its count")
         if reward not in REWARDS:
             raise unknown_name("reward", reward, REWARDS)
         return REWARDS[reward]
@@ -241,7 +280,7 @@ class Rewarding(NamedTuple):
                 f" {vehicles - 1} pairs of vehicles"
             )
         harm = params.harm if line_only else 0.0  # the compiled step rewards the line's harm; `growth` any other
-        settings = StepSettings(learners, *times, harm, params.terminal, COUNTS[params.harm_count])
+        settings = StepSettings(learners, *times, harm, params.terminal, params.harm_count)
         counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)
         reported = tuple(dict.fromkeys((*counted, *report)))
         components = () if vector is None else components_of(vector, counted, vehicles)
@@ -271,17 +310,18 @@ class Rewarding(NamedTuple):
         """The state ``after`` with the reward's new memory, and the step with the complete reward."""
         values = {name: function(before, step, after) for name, _, function in self.terms}
         if self.shaping is not None:
-            values["shaping"], memory = self.shaping.value(before, step, after)
-            after = after._replace(memories={**after.memories, "shaping": memory})
+            values["shaping"], memory = self.shaping.value(before, after)
+            after = State(*after[:5], {**after.memories, "shaping": memory})
         extra = np.zeros(step.reward.shape)
         for name, weight, _ in self.terms:
             if weight:
                 extra += weight * _wide(values[name])
         if self.params.shaping:
             extra += self.params.shaping * values["shaping"]
-        extra[before.ended] = 0.0
+        if self.terms:
+            extra[before.ended] = 0.0
         reward_terms = {**self.shared(step), **values}
-        step = step._replace(reward=step.reward + extra, terms=reward_terms)
+        step = Step(step.reward + extra, step.out, step.time_step_s, reward_terms)
         if self.components:
             step = step._replace(terms={name: reward_terms[name] for name in reward_terms if name in self.reported})
             vector = np.stack(
@@ -293,8 +333,10 @@ class Rewarding(NamedTuple):
 
     def shared(self, step: Step) -> dict[str, Floats]:
         """Values of the terms that the compiled step computes, name -> [n]."""
-        names = [name for name in ("harm", "terminal") if name in self.reported]
-        return {name: -step.cost if name == "harm" else step.out[SAFE_END] for name in names}
+        values = {"harm": -step.cost} if "harm" in self.reported else {}
+        if "terminal" in self.reported:
+            values["terminal"] = step.out[SAFE_END]
+        return values
 
 
 def _wide(value: Floats) -> Floats:

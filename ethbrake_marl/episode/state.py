@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import Count, amount_so_far, pair_amounts, weights_of
+from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount, all_counts, amount_so_far, pair_amounts
 from ethbrake_marl.episode.departures import MARKS, SHOWN, departing_worlds
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
@@ -185,26 +185,23 @@ class State(NamedTuple):
         """Whether the world has had an impact, [n]."""
         return np.asarray(self.line[:, IMPACTS].any(axis=1))
 
-    def harm(self, count: Count = "first") -> Floats:
-        """Harm of each world so far, [n] m2/s2; ``count`` is the count of harm (``episode.counts``)."""
-        self._check_count(count)
-        out = np.empty(self.n)
-        _harm(self.line, weights_of(count), out)
+    def harm(self, harm_count: AnyCount = HONEST) -> Floats:
+        """Harm of each world so far, [n] m2/s2; ``harm_count`` is the count of harm (``episode.counts``)."""
+        count, out = self._defined(harm_count), np.empty(self.n)
+        _harm(self.line, count.weights, out)
         return out
 
-    def pair_harm(self, count: Count = "first") -> Floats:
+    def pair_harm(self, harm_count: AnyCount = HONEST) -> Floats:
         """Harm of each pair of neighbouring vehicles so far, [n, N - 1] m2/s2.
 
         The pair of the obstacle and Vehicle 1 is left out. So the result lacks the harm of impacts with the obstacle
         and, in the honest cost, the price of Vehicle 1's driving and motion.
         """
-        self._check_count(count)
-        return pair_amounts(self.line, count)[0, :, 1:-1]
+        return pair_amounts(self.line, self._defined(harm_count))[0, :, 1:-1]
 
-    def borne_harm(self, count: Count = "first") -> Floats:
+    def borne_harm(self, harm_count: AnyCount = HONEST) -> Floats:
         """Harm that each vehicle has borne so far, [n, N] m2/s2. The two shares of a pair sum to the pair's harm."""
-        self._check_count(count)
-        (pairs, unshared), out = pair_amounts(self.line, count), np.empty((self.n, self.vehicles))
+        (pairs, unshared), out = pair_amounts(self.line, self._defined(harm_count)), np.empty((self.n, self.vehicles))
         split_harm(pairs - unshared, self.car[:, MASS], out)
         return out + unshared[:, :-1]
 
@@ -218,12 +215,21 @@ class State(NamedTuple):
         """Whether these worlds move and collide as ``motion`` computes, because nothing marks them as departing."""
         return MARKS not in self.memories
 
-    def _check_count(self, count: Count) -> None:
-        if self.is_exact:
-            return
-        _first_impacts, _all_impacts, *beside_harm = weights_of(count)
-        if any(beside_harm):
-            require(self, "the honest cost", simulates=True)
+    def defines(self, count: HarmCount) -> bool:
+        """Whether these worlds have everything that the count requires."""
+        return self.is_exact or not count.requires
+
+    @property
+    def counts(self) -> list[HarmCount]:
+        """All counts of harm that are defined in these worlds."""
+        return [count for count in all_counts() if self.defines(count)]
+
+    def _defined(self, harm_count: AnyCount) -> HarmCount:
+        """The count; raises ``InvalidInput`` if it is not defined in these worlds."""
+        count = HarmCount.of(harm_count)
+        if not self.defines(count):
+            require(self, f"the {count.words}", simulates=True)
+        return count
 
 
 def mark(state: State, names: Iterable[str]) -> State:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.commands import LARGEST_ACTION, action_array, check_actions, write_commands
-from ethbrake_marl.episode.counts import COUNTS, OF_FIRST, OF_TOTAL, beside_harm
+from ethbrake_marl.episode.counts import HONEST, OF_FIRST, OF_TOTAL, HarmCount, beside_harm
 from ethbrake_marl.episode.script_calls import ask_scripts
 from ethbrake_marl.episode.state import CLOCK_COLUMNS, END, ENDED, FIRST_DECISION, LAST, NUMBER, STEPS, TIME, State
 from ethbrake_marl.episode.threads import call_slices
@@ -50,7 +50,7 @@ class StepSettings(NamedTuple):
     horizon_s: float
     harm: float = 1.0  # weight of the line's harm in the reward
     terminal: float = 0.0  # weight of an end without impact in the reward
-    weights: Floats = COUNTS["first"]  # [6] of the count of harm in the reward (``episode.counts``)
+    harm_count: HarmCount = HONEST  # of harm in the reward (``episode.counts``)
     most_steps: float = np.inf  # number of steps after which an episode is truncated, as at the horizon
     threads: int = 1  # that advance slices of many worlds at once (``episode.threads``)
 
@@ -126,7 +126,7 @@ def step(
         rows: tuple[int, int] = step_worlds(
             old_line, old_clock, old_wanted, not donate, first, end, line, car, clock, wanted, actions,
             scratch_for(wanted.shape[1]), out, reward, settings.learners, settings.time_step_s, settings.harm,
-            settings.terminal, settings.weights,
+            settings.terminal, settings.harm_count.weights,
         )  # fmt: skip
         return rows
 
@@ -150,7 +150,7 @@ def step_worlds(
     ``car``, ``clock`` and ``wanted`` are arrays of a ``State``, ``out`` and ``reward`` of a ``Step``; if ``copies``,
     ``line``, ``clock`` and ``wanted`` get the contents of ``old_line``, ``old_clock`` and ``old_wanted`` first.
     ``scratch`` is the working memory of the physics. ``harm`` and ``terminal`` are weights of the reward; ``weights``
-    [6] belong to the count of harm in the reward (``COUNTS``).
+    [6] belong to the count of harm in the reward.
     """
     for k in range(len(actions)):
         for c in range(learners.shape[0]):

@@ -14,7 +14,7 @@ push          minus the push of all contacts of the line (``motion.push``)
 drove         minus the speed that the vehicle's engine alone gives it (``motion.forces.driving``)
 still_moving  -1 if the episode ends at the horizon with a vehicle in motion
 shaping       for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
-              the learners can reach. It leaves the optimal policy unchanged (Ng, Harada and Russell 1999)
+              the learners can reach (``episode.shaping``)
 harm_K        minus the harm that vehicle_K bears
 pair_J_K      minus the harm of the pair of vehicle_J and vehicle_K behind it
 obstacle      minus the harm of impacts with the obstacle
@@ -32,20 +32,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import COUNTED_ROWS, pair_amounts
+from ethbrake_marl.episode.counts import HarmCount, pair_amounts
 from ethbrake_marl.episode.functions import call_function, check_finite_values, description_of
-from ethbrake_marl.episode.hold import descend
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
-from ethbrake_marl.episode.state import END, State, require
-from ethbrake_marl.episode.step import TRUNCATED, Step, StepSettings
+from ethbrake_marl.episode.state import State, require
+from ethbrake_marl.episode.step import TRUNCATED, Step
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
 from ethbrake_marl.motion.layout import DROVE, PUSHED, TOTAL, Floats
 from ethbrake_marl.registry import Registry
 
 TermFunction = Callable[[State, Step, State], Floats]
-
-BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
 
 
 class Term(NamedTuple):
@@ -161,54 +158,16 @@ def still_moving(before: State, step: Step, after: State) -> Floats:
     return 0.0 - step.out[TRUNCATED] * after.moving
 
 
-def potential(settings: StepSettings, state: State) -> Floats:
-    """Minus the least further harm that constant decelerations of the learners can reach, [n] m2/s2.
-
-    The learners choose in turn, front to rear, among nine shares of their braking capacity (several learners: in two
-    rounds); all other vehicles brake fully. Harm is counted as in the reward. The potential of an episode that has
-    ended is 0.
-    """
-    learners = settings.learners.tolist()
-    # With one learner only the least harm counts: full braking comes first, which often does no more harm.
-    shares, rounds = (BRAKING_SHARES[::-1], 1) if len(learners) == 1 else (BRAKING_SHARES, 2)
-    line = state.line.copy()
-    line[:, COUNTED_ROWS] = 0.0
-    state = state._replace(line=line)
-    _, least = descend(state, learners, shares, rounds, state.clock[:, END], settings.weights)
-    least[state.ended] = 0.0
-    return -least
-
-
-class Shaping(NamedTuple):
-    """The term shaping. Its memory is the potential of the present state, [n] m2/s2."""
-
-    settings: StepSettings
-    discount: float
-
-    def begin(self, state: State) -> Floats:
-        return potential(self.settings, state)
-
-    def value(self, before: State, step: Step, after: State) -> tuple[Floats, Floats]:
-        """Value of the term, [n, N] m2/s2, and the new memory, [n] m2/s2."""
-        new = potential(self.settings, after)
-        value = np.zeros((after.n, after.vehicles))
-        value[:, self.settings.learners - 1] = (self.discount * new - before.memories["shaping"])[:, np.newaxis]
-        return value, new
-
-
-def growth(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
+def growth(objectives: Sequence[Objective], count: HarmCount, before: State, step: Step, after: State) -> Floats:
     """Term harm, [n, N]: minus the increase of the amount that each vehicle's objective minimises.
 
-    ``objectives`` has one per vehicle; ``count`` is the name of the count of harm (``episode.counts``).
+    ``objectives`` has one per vehicle.
     """
     return -amounts(objectives, before, after, count)
 
 
-def component(name: str, count: str) -> TermFunction:
-    """Function that computes the component ``harm_K``, ``pair_J_K`` or ``obstacle`` of a vector reward, [n].
-
-    ``count`` is the name of the count of harm.
-    """
+def component(name: str, count: HarmCount) -> TermFunction:
+    """Function that computes the component ``harm_K``, ``pair_J_K`` or ``obstacle`` of a vector reward, [n]."""
     if name == "obstacle":
         return partial(_of_pair, 0, count)
     last_vehicle = int(name.rpartition("_")[2])
@@ -217,15 +176,15 @@ def component(name: str, count: str) -> TermFunction:
     return partial(_of_pair, last_vehicle - 1, count)  # columns of pairs begin with the obstacle and Vehicle 1
 
 
-def _borne(vehicle: int, count: str, before: State, step: Step, after: State) -> Floats:
+def _borne(vehicle: int, count: HarmCount, before: State, step: Step, after: State) -> Floats:
     return 0.0 - Harm.of(_increase(count, before, after), after.car).borne[:, vehicle]
 
 
-def _of_pair(pair: int, count: str, before: State, step: Step, after: State) -> Floats:
+def _of_pair(pair: int, count: HarmCount, before: State, step: Step, after: State) -> Floats:
     return 0.0 - _increase(count, before, after)[0, :, pair]
 
 
-def _increase(count: str, before: State, after: State) -> Floats:
+def _increase(count: HarmCount, before: State, after: State) -> Floats:
     return pair_amounts(after.line, count) - pair_amounts(before.line, count)
 
 

@@ -16,7 +16,6 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 BENCHMARK = "benchmark"  # group of scenarios, the tasks
 EPISODES = 2_000  # worlds of each task, from the evaluation list of seed ``SEED``
-COUNT = "honest"  # what methods are compared by
 BEST_KNOWN = "limits"  # measure that gives the share of the possible reduction
 PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 COLUMNS = (
@@ -52,7 +51,7 @@ def evaluate_task(scenario: AnyScenario, agents: Any, *, episodes: int = EPISODE
     """Result of agents in the evaluation list of a task. Agents that choose minimise the honest cost."""
     loaded = load_scenario(scenario)
     measures = ["pushed_mps", *benchmark_measures(loaded, episodes=episodes, seed=seed)]
-    return evaluate(loaded, agents, episodes=episodes, seed=seed, harm_count=COUNT, measures=measures)
+    return evaluate(loaded, agents, episodes=episodes, seed=seed, measures=measures)
 
 
 def benchmark_sheet(tables: Mapping[str, SummaryTable]) -> Sheet:

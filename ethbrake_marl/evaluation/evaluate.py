@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agent_names import open_game, require_learner, teams_of
 from ethbrake_marl.agents.team import CHUNK, Team, agents_measures, check_knows, play
-from ethbrake_marl.episode.counts import check_count
+from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import KNOWLEDGE, MODEL, UNSTATED
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation.measure_registry import check_measure_name, measures_called
-from ethbrake_marl.evaluation.measures import DEFAULT, Measure, MeasureValues, Watch, measure_columns, naming
+from ethbrake_marl.evaluation.measures import Measure, MeasureValues, Watch, measure_columns, naming, usual_measures
 from ethbrake_marl.evaluation.provenance import about_scenario, policy_digests, versions, worlds_sha256
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
@@ -52,6 +52,7 @@ class Result:
     knows: Mapping[str, str]  # team -> what the team must know
     drivers: Mapping[str, Mapping[str, str]]  # team -> vehicle -> name of its agent
     policies: Mapping[str, Mapping[str, str]]  # team -> vehicle -> SHA-256 of its policy
+    remarks: Mapping[str, Sequence[str]]  # team -> its other counts of harm, as in ``bounds total harm``
     about: Mapping[str, Any]  # plain data: scenario, seed, times, digests, versions
 
     @property
@@ -122,7 +123,7 @@ def evaluate(
     scenario: AnyScenario | None = None,
     episodes: int | None = None,
     seed: int | None = None,
-    harm_count: str = "first",
+    harm_count: AnyCount = HONEST,
     measures: Iterable[str] | str = (),
     jobs: int = 1,
     on_done: Callable[[int], None] | None = None,
@@ -141,8 +142,8 @@ def evaluate(
         scenario: scenario to which ``worlds`` belong, if they are worlds at the alert.
         episodes: number of worlds from the evaluation list; None: 10,000.
         seed: seed of the evaluation list; None: 7.
-        harm_count: what optimising agents minimise: ``first``, as in the paper, ``total``, or ``honest``, under which
-            pushing hardly pays (``episode.counts``).
+        harm_count: what optimising agents minimise: ``honest``, under which pushing hardly pays, ``first``, as in the
+            paper, ``total``, or another count of harm (``episode.counts``).
         measures: names of further measures (``evaluation.measure_registry``).
         jobs: number of processes.
         on_done: function that is called with the number of worlds driven so far.
@@ -169,15 +170,15 @@ def evaluate(
     if test_worlds is not None and (episodes, seed) != (None, None):
         raise InvalidInput("evaluate: episodes and seed choose worlds of a list; leave them out if worlds are given")
     episodes, seed = EPISODES if episodes is None else episodes, SEED if seed is None else seed
-    check_count("evaluate: harm_count", harm_count)
-    loaded, game = open_game(scenario)
+    count = HarmCount.of(harm_count, "evaluate: harm_count")
+    loaded, game = open_game(scenario, reward={"harm_count": count})
     require_learner(loaded)
     about = about_scenario(loaded, None if test_worlds is not None else seed)
     if test_worlds is None:
         check_whole_number("episodes", episodes, 1)
         test_worlds = loaded.draw(int(episodes), seed)
-    teams = teams_of(agents, loaded, harm_count=harm_count)
-    about["agent_settings"] = {"harm_count": harm_count}
+    teams = teams_of(agents, loaded, harm_count=count)
+    about["agent_settings"] = {"harm_count": count.name}
     return evaluate_teams(test_worlds, teams, game, measures_called(measures or ()), jobs, about=about, on_done=on_done)
 
 
@@ -201,7 +202,7 @@ def evaluate_teams(
         check_whole_number("jobs", jobs, 1)
     draw = worlds if isinstance(worlds, DrawnWorlds) else DrawnWorlds.from_state(worlds)
     _check(draw.worlds, agents, game)
-    chosen = (*DEFAULT, *measures)
+    chosen = (*usual_measures(), *measures)
     n, of_worlds, labels = draw.worlds.n, columns_of(draw), draw.worlds.memories.get(LABELS, {})
     memories = {name: memory for name, memory in draw.worlds.memories.items() if name != LABELS}
     alert = game.marked(draw.worlds._replace(memories=memories))
@@ -210,7 +211,7 @@ def evaluate_teams(
             raise InvalidInput(f"measure {measure.name!r}: is the name of a column of the worlds; give another name")
     owners: dict[str, Measure] = {}
     for measure in chosen:
-        for statistic in measure.statistics:
+        for statistic in measure.all_statistics():
             owner = owners.setdefault(statistic.key, measure)
             if owner != measure:
                 raise InvalidInput(
@@ -238,6 +239,7 @@ def evaluate_teams(
         {name: known_by(team, game) for name, team in agents.items()},
         {name: {f"vehicle_{i}": agent.name for i, agent in team.drivers.items()} for name, team in agents.items()},
         {name: policy_digests(team.drivers) for name, team in agents.items()},
+        {name: team.remarks(game.settings.harm_count) for name, team in agents.items()},
         {
             "scenario": game.name,
             "seed": None,

@@ -14,7 +14,6 @@ from inspect import signature
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objective_name, objectives_of
 from ethbrake_marl.episode.reward import RewardParams
@@ -22,7 +21,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.episode.terms import BUILT_IN, TERMS, TermFunction, collision, drove, jerk, push, risk
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, unknown_name
-from ethbrake_marl.evaluation.measures import DEFAULT, Measure, MeasureValue, Statistic, Watch
+from ethbrake_marl.evaluation.measures import DEFAULT, Measure, MeasureValue, Statistic, Watch, usual_measures
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part, Registry
@@ -74,7 +73,7 @@ def _check_measure(
             f"measure {name!r}: give one function, of(game, alert, last) or watch(game, alert), with a docstring that"
             " describes the measure"
         )
-    if name in (*DEFAULT_MEASURES, *RESERVED_NAMES) or name in TERMS:
+    if name in {*RESERVED_NAMES, *(measure.name for measure in usual_measures())} or name in TERMS:
         raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
     return Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(statistics), watch)
 
@@ -88,7 +87,6 @@ def check_measure_name(name: object) -> None:
         )
 
 
-DEFAULT_MEASURES = tuple(measure.name for measure in DEFAULT)
 RESERVED_NAMES = ("agent", "knows", "kind", "world", "scenario", "recording", "hidden", "exploits", "results_sha256")
 
 MEASURES: Registry[Measure] = Registry(
@@ -200,8 +198,7 @@ def _intervention(before: State, step: Step, after: State) -> Floats:
 
 def _objective(name: str, game: Game, alert: State, last: State) -> MeasureValue:
     objectives = objectives_of(name, last.vehicles)
-    counts = [count for count in COUNTS if count != "honest" or last.is_exact]
-    values = {count: amounts(objectives, None, last, count) for count in counts}
+    values = {count.name: amounts(objectives, None, last, count) for count in last.counts}
     return values if objectives[0].differs else {count: value[:, 0] for count, value in values.items()}
 
 

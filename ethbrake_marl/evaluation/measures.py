@@ -10,7 +10,7 @@ property of a state                      meaning (``episode.state.State``)
 =======================================  ===============================================================================
 ``speeds_mps``, ``gaps_m``               [n, N] m/s; [n, N - 1] m, front to rear
 ``obstacle_gap_m``                       [n] m; infinite without an obstacle
-``harm("first")``, ``harm("total")``     [n] m2/s2 of the line so far: first impact of each pair, all impacts
+``harm()``, ``harm("total")``            [n] m2/s2 of the line so far: honest cost, harm of all impacts
 ``borne_harm(...)``                      [n, N] m2/s2 that each vehicle bears
 ``pair_harm(...)``                       [n, N - 1] m2/s2 of each pair
 ``collided``, ``pair_hit``               [n]; [n, N - 1] whether there was an impact
@@ -29,20 +29,21 @@ m2/s2; ``reward`` [n, N] and its ``terms``; ``terminated``, ``truncated`` and ``
 An agent, a shield or a layer may report measures of its own (``agents.team.Agent``, ``episode.game.Shield``,
 ``episode.layer.Layer``): a mapping name -> value, with values of the same form.
 
-Every evaluation has the measures in DEFAULT. Costly ones are chosen by name: ``evaluation.measure_registry``.
+Every evaluation has the measures in DEFAULT and one for each registered count of harm. Costly ones are chosen by name:
+``evaluation.measure_registry``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, IMPACT_COUNTS, HarmCount, all_counts
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import Step
@@ -83,6 +84,16 @@ class Statistic(NamedTuple):
     ending: str = ""  # what follows the measure's name in the column's name
     meaning: str = ""  # "": the measure's meaning
 
+    def of_counts(self) -> list[Statistic]:
+        """The statistic; or, if ``{count}`` or ``{words}`` is in its texts, one for each count of harm."""
+        if "{count}" not in self.key:
+            return [self]
+        texts = [{"count": count.name, "words": count.words} for count in all_counts()]
+        return [
+            self._replace(**{field: text.format(**of) for field, text in self._asdict().items() if field != "kind"})
+            for of in texts
+        ]
+
 
 class Measure(NamedTuple):
     name: str
@@ -92,6 +103,9 @@ class Measure(NamedTuple):
     statistics: tuple[Statistic, ...] = ()  # of its columns; a column without any gets its mean or rate
     watch: Callable[[Game, State], Watch | None] | None = None  # makes a `Watch` from (game, alert)
     # without `of` and `watch`: a value that agents, shields or layers report by their own method `measures`
+
+    def all_statistics(self) -> list[Statistic]:
+        return [each for statistic in self.statistics for each in statistic.of_counts()]
 
 
 def measure_columns(measure: Measure, measurement: MeasureValue, last: State) -> dict[str, MeasureValues]:
@@ -140,9 +154,9 @@ def collided(game: Game, alert: State, last: State) -> MeasureValue:
     return last.collided
 
 
-def harm(count: str, game: Game, alert: State, last: State) -> MeasureValue:
+def harm(count: HarmCount, game: Game, alert: State, last: State) -> MeasureValue:
     """Harm at the end, [n] m2/s2: key ``""`` for the line, ``"1"`` to ``"N"`` for what each vehicle bears."""
-    if count == "honest" and not last.is_exact:
+    if not last.defines(count):
         return None
     borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}
     return {"": last.harm(count), **borne}
@@ -172,38 +186,32 @@ def _built_in(of: Callable[[Game, State, State], MeasureValue], unit: str, *stat
     return Measure(of.__name__, of, of.__doc__ or "", unit, statistics)
 
 
+MEANINGS = {
+    "first": "Squared closing speed of each pair's first impact, summed over the pairs, as the paper counts harm. With"
+    " the number of a vehicle: what it bears.",
+    "total": "Squared closing speed of every impact, summed. After a light first impact, first-impact harm does not"
+    " count a hard second one of the same pair; total harm does.",
+    "honest": "Total harm, harm that contacts pass on, and a price for pushes, for driving and for motion at the"
+    " horizon (docs/game.md).",
+}
+
+
+@cache
+def harm_measure(count: HarmCount) -> Measure:
+    """Measure of a count of harm, with the column of the count."""
+    decrease = f"Decrease, {count.words.removesuffix(' harm')}" if count in IMPACT_COUNTS else ""
+    statistics = (
+        Statistic(count.column, "mean", count.words.capitalize(), "\n".join(count.words.capitalize().split())),
+        Statistic(f"{count.column}_difference", "difference"),
+        Statistic(f"harm_decrease_{count.name}", "decrease", decrease, f"Decrease\n{count.name}"),
+    )
+    meaning = MEANINGS.get(count.name, f"{count.words.capitalize()}, a registered count of harm.")
+    return Measure(count.column, partial(harm, count), meaning, "m2/s2", statistics)
+
+
 DEFAULT = (
     _built_in(collided, "", Statistic("collision_rate", "rate", "Collisions")),
-    Measure(
-        "first_impact_harm", partial(harm, "first"),
-        "Squared closing speed of each pair's first impact, summed over the pairs, as the paper counts harm. With the"
-        " number of a vehicle: what it bears.", "m2/s2",
-        (
-            Statistic("first_impact_harm", "mean", "First-impact harm", "First-impact\nharm"),
-            Statistic("first_impact_harm_difference", "difference"),
-            Statistic("harm_decrease_first", "decrease", "Decrease, first-impact", "Decrease\nfirst"),
-        ),
-    ),
-    Measure(
-        "total_harm", partial(harm, "total"),
-        "Squared closing speed of every impact, summed. After a light first impact, first-impact harm does not count a"
-        " hard second one of the same pair; total harm does.", "m2/s2",
-        (
-            Statistic("total_harm", "mean", "Total harm", "Total\nharm"),
-            Statistic("total_harm_difference", "difference"),
-            Statistic("harm_decrease_total", "decrease", "Decrease, total", "Decrease\ntotal"),
-        ),
-    ),
-    Measure(
-        "honest_cost", partial(harm, "honest"),
-        "Total harm, harm that contacts pass on, and a price for pushes, for driving and for"
-        " motion at the horizon (docs/game.md).", "m2/s2",
-        (
-            Statistic("honest_cost", "mean", "Honest cost", "Honest\ncost"),
-            Statistic("honest_cost_difference", "difference"),
-            Statistic("harm_decrease_honest", "decrease"),
-        ),
-    ),
+    *map(harm_measure, BUILT_IN_COUNTS),
     _built_in(impacts, "1"),
     _built_in(hardest_impact_mps, "m/s"),
     _built_in(end_s, "s"),
@@ -228,22 +236,23 @@ DEFAULT = (
 )  # fmt: skip
 
 
+def usual_measures() -> tuple[Measure, ...]:
+    """Measures of every evaluation: ``DEFAULT`` and all registered counts of harm."""
+    return (*DEFAULT, *(harm_measure(count) for count in all_counts() if count not in BUILT_IN_COUNTS))
+
+
 # ---- measures that are chosen by name
 
 
 def worst5(game: Game, alert: State, last: State) -> MeasureValue:
     """Mean of the worst 5 % of the worlds, in each count of harm. In rows per world: the harm or cost of the world."""
-    return {count: last.harm(count) for count in COUNTS if count != "honest" or last.is_exact}
+    return {count.name: last.harm(count) for count in last.counts}
 
 
 WORST5 = Part(
-    worst5,
-    unit="m2/s2",
-    statistics=tuple(
-        Statistic(f"worst5_{count}", "worst", f"Worst 5 %, {name}", f"Worst 5 %\n{count}", count)
-        for count, name in IN_WORDS.items()
-    ),
-)
+    worst5, unit="m2/s2",
+    statistics=(Statistic("worst5_{count}", "worst", "Worst 5 %, {words}", "Worst 5 %\n{count}", "{count}"),),
+)  # fmt: skip
 
 
 def own_way_m(alert: State, body: int, until_s: float) -> Floats:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ethbrake_marl.agent_names import open_game, require_learner, teams_of
 from ethbrake_marl.agents.team import Team, play
-from ethbrake_marl.episode.counts import check_count
+from ethbrake_marl.episode.counts import HONEST, IMPACT_COUNTS, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.errors import InvalidInput, count_of
@@ -84,7 +84,7 @@ class EpisodeRecord:
         return self.states[-1]
 
     def __repr__(self) -> str:
-        first, total = (float(self.last.harm(count)[0]) for count in ("first", "total"))
+        first, total = (float(self.last.harm(count)[0]) for count in IMPACT_COUNTS)
         return (
             f"EpisodeRecord({self.agent!r:.60} on {self.scenario!r}, {len(self.time_s)} samples to"
             f" {self.time_s[-1]:g} s, {count_of(int(self.impacts.number.sum()), 'impact')}, harm {first:.2f}"
@@ -99,7 +99,7 @@ def record_episode(
     scenario: AnyScenario | None = None,
     number: int = 0,
     seed: int = 7,
-    harm_count: str = "first",
+    harm_count: AnyCount = HONEST,
     sample_s: float = SAMPLE_S,
 ) -> EpisodeRecord:
     """Let one agent drive one world exactly as in ``evaluate``, and record the motion.
@@ -137,13 +137,13 @@ def record_agents(
     scenario: AnyScenario | None = None,
     number: int = 0,
     seed: int = 7,
-    harm_count: str = "first",
+    harm_count: AnyCount = HONEST,
     sample_s: float = SAMPLE_S,
 ) -> dict[str, EpisodeRecord]:
     """Record of each agent in one world, by name. ``agents`` as in ``evaluate``, the rest as in ``record_episode``."""
     if not (isinstance(sample_s, int | float) and 0.0 < sample_s < math.inf):
         raise InvalidInput(f"record_episode: sample_s = {sample_s!r}: must be a finite number of seconds above 0")
-    check_count("record_episode: harm_count", harm_count)
+    count = HarmCount.of(harm_count, "record_episode: harm_count")
     if isinstance(worlds, State):
         if scenario is None:
             raise InvalidInput("record_episode: a world needs its scenario, for instance scenario='paper-random'")
@@ -159,7 +159,7 @@ def record_agents(
             f"record_episode: worlds has {count_of(world.n, 'world')}; pass exactly 1 at the alert, for instance"
             " worlds.take([0])"
         )
-    teams = teams_of(agents, loaded, harm_count=harm_count)
+    teams = teams_of(agents, loaded, harm_count=count)
     return {name: record_episodes(world, team, game, sample_s)[0] for name, team in teams.items()}
 
 

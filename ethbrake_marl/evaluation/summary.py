@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from textwrap import fill
 from typing import Any, Literal
@@ -10,12 +10,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.counts import COLUMN
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, COUNTS, HONEST
 from ethbrake_marl.episode.layer import MODEL, STATE
 from ethbrake_marl.errors import InvalidInput, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, PUSHED_FAR_M, Measure, MeasureValues, Statistic
+from ethbrake_marl.evaluation.measures import HORIZON, PUSHED_FAR_M, Measure, MeasureValues, Statistic, usual_measures
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, flat_row, terminal_text
 from ethbrake_marl.worlds.quantities import QUANTITIES
 
@@ -29,7 +29,10 @@ _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
 WIDE = 30  # characters of a line about a team in a terminal
 FEW = 3  # teams whose intervals fit beside each other in a terminal
-FIRST_COLUMNS = ("collision_rate", *COLUMN.values())  # columns whose intervals stand below the values
+FIRST_COLUMNS = (
+    "collision_rate",
+    *(count.column for count in BUILT_IN_COUNTS),
+)  # columns whose intervals stand below the values
 
 SYMBOLS = {
     "gaps_m": ("d", "m"), "speeds_mps": ("v", "m/s"), "braking_capacity_mps2": ("braking capacity", "m/s²"),
@@ -72,6 +75,7 @@ class SummaryRow:
     hidden_share: float  # share of worlds in which the V2X channel hides something from a controlled vehicle
     drivers: Mapping[str, str]  # vehicle -> name of its agent
     policies: Mapping[str, str]  # vehicle -> SHA-256 of its policy
+    remarks: Sequence[str] = ()  # other counts of harm that the team minimises
 
     def __getitem__(self, key: str) -> Estimate | None:
         if key not in self.estimates:
@@ -110,10 +114,10 @@ class SummaryRow:
 
     @property
     def about(self) -> str:
-        """What the team knows, † if it is omniscient, and who drives which vehicle if its agents differ."""
+        """What the team knows, with † if it is omniscient; its other counts of harm; who drives which vehicle."""
         mixed = len({*self.drivers.values()}) > 1
         drivers = [f"{vehicle}: {agent}" for vehicle, agent in self.drivers.items() if mixed]
-        return "; ".join([f"{SEES_THROUGH} " * self.sees_through + self.knows, *drivers])
+        return "; ".join([f"{SEES_THROUGH} " * self.sees_through + self.knows, *self.remarks, *drivers])
 
     def to_json(self) -> dict[str, Any]:
         """Row as plain data: each estimate with interval, standard error and degrees of freedom; None if unknown."""
@@ -121,7 +125,7 @@ class SummaryRow:
             "agent": self.agent, "knows": self.knows, "sees_through_channel": self.sees_through,
             "hidden_share": self.hidden_share, "episodes": self.episodes, "collisions": self.collisions,
             "horizon_ends": self.horizon_ends, "exploits": list(self.exploits),
-            "drivers": dict(self.drivers),
+            "drivers": dict(self.drivers), "remarks": [*self.remarks],
         }  # fmt: skip
         for key, estimate in self.estimates.items():
             plain |= Estimate.side_by_side({key: estimate})
@@ -155,6 +159,13 @@ class SummaryTable(list[SummaryRow]):
     def __str__(self) -> str:
         return terminal_text(*self.tables())
 
+    @property
+    def heading(self) -> str:
+        """Which count of harm the agents minimise; "" if the result does not say it."""
+        name = self.parameters.get("agent_settings", {}).get("harm_count")
+        words = COUNTS[name].words if name in COUNTS else name
+        return f"Agents minimise {words}" if words else ""
+
     def sheet(self) -> Sheet:
         """Table with all columns that have a heading."""
         columns = [
@@ -163,7 +174,7 @@ class SummaryTable(list[SummaryRow]):
             if statistic.heading
         ]
         rows = [(row.marked, row.about, *(row.estimates[c.name] for c in columns)) for row in self]
-        return Sheet("", ["Agent", "Knows", *columns], rows)
+        return Sheet(self.heading, ["Agent", "Knows", *columns], rows)
 
     def terminal(self) -> Sheet:
         """Table for a terminal; only the first columns have intervals."""
@@ -177,7 +188,7 @@ class SummaryTable(list[SummaryRow]):
         for name, about, *cells in map(list, sheet.rows):
             rows.append(("\n".join([name, *(fill(part, WIDE) for part in about.split("; "))]), *cells))
         first = [column for column in columns if column.name in FIRST_COLUMNS]
-        return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
+        return Sheet(self.heading, [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
 
     def measures(self) -> Sheet | None:
         """Table of the measures without a column in the main table; None if there are none.
@@ -186,7 +197,7 @@ class SummaryTable(list[SummaryRow]):
         """
         keys: dict[tuple[Any, ...], list[str]] = {}  # measure, unit and a cell for each team -> keys of estimates
         for key, (measure, statistic) in self.statistics.items():
-            if not statistic.heading and measure not in DEFAULT:
+            if not statistic.heading and measure not in usual_measures():
                 unit = f" ({measure.unit})" if measure.unit and statistic.kind != "decrease" else ""
                 keys.setdefault((measure.name, unit, *(row.estimates[key] for row in self)), []).append(key)
         rows = [
@@ -239,7 +250,7 @@ class SummaryTable(list[SummaryRow]):
             if statistic.heading
         }
         for measure, statistic in self.statistics.values():
-            if not statistic.heading and measure not in DEFAULT:
+            if not statistic.heading and measure not in usual_measures():
                 texts[measure.name] = measure.meaning
         return HEADINGS | {
             name: text.replace("``", "") for name, text in texts.items() if not name.startswith("Decrease")
@@ -296,6 +307,7 @@ def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
             hidden_share=float(result.worlds["hidden"].mean()),
             drivers=result.drivers[team],
             policies=result.policies[team],
+            remarks=result.remarks[team],
         )
         for team, team_columns in columns.items()
     ]
@@ -310,14 +322,11 @@ def _statistics_of(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
     kinds = {
         name: column.dtype.kind for team_columns in result.columns.values() for name, column in team_columns.items()
     }
-    minimised = result.about.get("agent_settings", {}).get("harm_count")
     for name, kind in kinds.items():
         measure = result.measure_of(name)
         ending = name.removeprefix(measure.name).removeprefix("_")
-        declared = [statistic for statistic in measure.statistics if statistic.ending == ending]
+        declared = [statistic for statistic in measure.all_statistics() if statistic.ending == ending]
         for statistic in declared or [Statistic(name, "rate" if kind == "b" else "mean")]:
-            if minimised != "honest" and (measure.name == COLUMN["honest"] or ending == "honest"):  # only in JSON
-                statistic = statistic._replace(heading="")
             if kind != "U":
                 entries[statistic.key] = name, measure, statistic
     return dict(sorted(entries.items(), key=_sort_position))
@@ -372,10 +381,10 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
         Column("First-impact harm", "first_impact_harm", short="First-impact\nharm"),
         Column("Total harm", "total_harm", short="Total\nharm"),
     ]  # fmt: skip
-    keys = [key for key in FIRST_COLUMNS if all(table.statistics[key][1].heading for table in tables.values())]
+    keys = [key for key in FIRST_COLUMNS if all(key in table.statistics for table in tables.values())]
     rows: list[Any] = []
-    if COLUMN["honest"] in keys:
-        columns.append(Column("Honest cost", COLUMN["honest"], short="Honest\ncost"))
+    if HONEST.column in keys:
+        columns.append(Column("Honest cost", HONEST.column, short="Honest\ncost"))
     for name, table in tables.items():
         rows.append(name)
         for row in table:
@@ -389,7 +398,7 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
     elsewhere = [f"{row.agent} in {name}" for name, table in tables.items() for row in table if row.is_outside]
     if elsewhere:
         note += f" More than 10 % of its decisions are outside the range of its training: {', '.join(elsewhere)}."
-    return Sheet("", columns, rows, note)
+    return Sheet(next(iter(tables.values())).heading, columns, rows, note)
 
 
 def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:

@@ -71,7 +71,7 @@ class OneLearner(Face):
 
 
 class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
-    """One learner in a line whose other vehicles follow scripts (``gymnasium.make("EthBrake-v2")``).
+    """One learner in a line whose other vehicles follow scripts (``gymnasium.make("EthBrake-v3")``).
 
     Arguments, actions, ends, infos and options of ``reset`` are the same as in ``EthBrakeParallelEnv``. Its card,
     ``docs/reference/environment.md``, lists all observed numbers, terms of rewards, infos and arguments.
@@ -93,7 +93,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
         scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str] | None = None,
-        reward: Any = "harm",
+        reward: Any = "shaped",
         observation: Any = None,
         actions: int | None = None,
         reward_vector: Any = None,

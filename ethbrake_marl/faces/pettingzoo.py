@@ -43,8 +43,9 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     ``features`` of the box has their names (``episode.features``). ``state()`` is the full state of the line as a
     vector; ``episode`` is the ``State`` object.
 
-    **Rewards.** Minus the harm of the step: the sum of the squared closing speeds of its impacts (m2/s2), the same for
-    all vehicles. Other counts of harm, objectives of single vehicles and other terms: ``reward``.
+    **Rewards.** Minus 0.05 times the honest cost of the step (``episode.counts``), the same for all vehicles, and for
+    learners a potential whose discounted sum is a constant of the world (``episode.shaping``). ``info["cost"]`` is
+    the honest cost. Other counts of harm, objectives of single vehicles and other terms: ``reward``.
 
     **Start.** A world is drawn from the scenario at the alert, when Vehicle 1 begins to brake. The first observation
     comes when the first learner's latency has elapsed. ``reset(seed=...)`` begins with the first world of the seed, and
@@ -59,8 +60,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         scenario: a shipped name, the path or content of a YAML file, or a ``Scenario``.
         render_mode: a mode of ``metadata["render_modes"]``; None: no pictures.
         learners: names of the vehicles that learn; None: the scenario's.
-        reward: ``harm``, ``total-harm``, ``honest``, ``paper``, a mapping of settings, or ``RewardParams``. Under
-            ``harm``, the default, pushing is free; under ``honest`` it hardly pays (``episode.counts``).
+        reward: ``shaped``, ``honest`` (minus the honest cost, without scale and potential), ``harm``, ``total-harm``,
+            ``paper-reward``, a mapping of settings, or ``RewardParams``. Under ``harm`` pushing is free.
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
         max_cycles: number of steps after which an episode is truncated, as at a horizon; None: only at the horizon.
@@ -80,14 +81,14 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 
     """
 
-    metadata: Any = Metadata(name="ethbrake_v2", is_parallelizable=True)
+    metadata: Any = Metadata(name="ethbrake_v3", is_parallelizable=True)
 
     def __init__(
         self,
         scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str] | None = None,
-        reward: Any = "harm",
+        reward: Any = "shaped",
         observation: Any = None,
         agents: str = "all",
         max_cycles: int | None = None,

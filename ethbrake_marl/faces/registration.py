@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-GYMNASIUM_ID = "EthBrake-v2"
+GYMNASIUM_ID = "EthBrake-v3"
 MO_GYMNASIUM_ID = "EthBrakeMO-v1"  # with vector rewards, for MO-Gymnasium
-PETTINGZOO_ID = "ethbrake/ethbrake-v2"
+PETTINGZOO_ID = "ethbrake/ethbrake-v3"
 ENTRIES: dict[str, Any] = {
     "entry_point": "ethbrake_marl.faces.gymnasium:EthBrakeEnv",
     "vector_entry_point": "ethbrake_marl.faces.vector:EthBrakeVectorEnv",
@@ -25,4 +25,4 @@ def register_environments() -> None:
             gymnasium.register(id_, **ENTRIES, **settings)
     for interface, name in (("parallel", "parallel_env"), ("aec", "env")):
         if PETTINGZOO_ID not in getattr(pettingzoo, f"{interface}_registry", {PETTINGZOO_ID}):
-            pettingzoo.register(interface, PETTINGZOO_ID, f"ethbrake_marl.ethbrake_v2:{name}")
+            pettingzoo.register(interface, PETTINGZOO_ID, f"ethbrake_marl.ethbrake_v3:{name}")

@@ -34,7 +34,7 @@ def make_sb3_vec_env(
     n_envs: int,
     seed: int | None = None,
     learners: Sequence[str] | None = None,
-    reward: Any = "harm",
+    reward: Any = "shaped",
     observation: Any = None,
     horizon_is_end: bool = True,
     appended: Appended | None = None,

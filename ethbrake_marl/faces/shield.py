@@ -10,6 +10,7 @@ from typing import Any
 from ethbrake_marl.agent_names import AgentSettings, team_of, teams_of, wrap_team
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.team import Team
+from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.face import Face
@@ -28,7 +29,7 @@ def shield(
     mode: str = "step",
     *,
     scenario: AnyScenario | None = None,
-    harm_count: str | None = None,
+    harm_count: AnyCount | None = None,
     **options: Any,
 ) -> Any:
     """Shielded copy of an environment, of the same class, or a shielded team.
@@ -43,8 +44,8 @@ def shield(
             proposal the shield follows its own plan.
         mode: ``step``, ``episode`` (the paper's Algorithm 1), or another shield, as after the ``+`` in an agent's name.
         scenario: scenario in which an agent drives; only for agents.
-        harm_count: harm to bound: ``first``, ``total`` or ``honest`` (``episode.counts``). None: the count of the
-            environment's reward, or ``first`` for an agent.
+        harm_count: count of harm to bound (``episode.counts``). None: the count of the environment's reward, or
+            ``honest`` for an agent.
         options: settings of the mode: ``allowance`` (m2/s2) and ``cap`` (None or ``baseline``) for ``step``, ``bound``
             (``coupled`` or ``pairwise``) for ``episode``.
 
@@ -70,27 +71,27 @@ def shield(
         raise InvalidInput(f"shield: {env!r:.80}: {right}")
     base = getattr(env, "unwrapped", None)
     worlds: Any = getattr(base, "scenario", None) if scenario is None else load_scenario(scenario)
-    if harm_count is None:
-        harm_count = base.game.rewarding.params.harm_count if isinstance(base, Face) else "first"
-    around = partial(guard_team, mode=mode, scenario=worlds, harm_count=harm_count, options=options)
+    rewarded = base.game.rewarding.params.harm_count if isinstance(base, Face) else HONEST
+    count = rewarded if harm_count is None else HarmCount.of(harm_count, "shield: harm_count")
+    around = partial(guard_team, mode=mode, scenario=worlds, count=count, options=options)
     if not is_agent and not isinstance(env, Team):
-        return shielded_environment(env, base, policy, around, harm_count)
+        return shielded_environment(env, base, policy, around, count)
     team = team_of(env, worlds) if is_agent else env
     if policy is not None:
         raise InvalidInput(f"shield: {team.name!r} proposes by itself; leave out policy")
     return around(team)
 
 
-def guard_team(team: Team, mode: str, scenario: Scenario | None, harm_count: str, options: Mapping[str, Any]) -> Team:
-    settings = AgentSettings(f"{team.name}+{mode}", None, scenario, harm_count, options)
+def guard_team(team: Team, mode: str, scenario: Scenario | None, count: HarmCount, options: Mapping[str, Any]) -> Team:
+    settings = AgentSettings(f"{team.name}+{mode}", None, scenario, count, options)
     guarded_team = wrap_team(team, str(mode), settings)
     if guarded_team.shield is None:
         raise InvalidInput(f"shield: mode {mode!r}: is no shield; write it in the name of an agent, AGENT+{mode}")
     return guarded_team
 
 
-def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Team], Team], harm_count: str) -> Any:
-    """Shielded copy of an environment. If ``policy`` is the name of an agent, this agent minimises ``harm_count``.
+def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Team], Team], count: HarmCount) -> Any:
+    """Shielded copy of an environment. If ``policy`` is the name of an agent, this agent minimises ``count``.
 
     ``base`` is ``env`` without wrappers; ``around`` puts the shield around a team.
     """
@@ -109,7 +110,7 @@ def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Tea
     if policy is None:
         return with_game(env, game._replace(shield=around(NO_TEAM).shield))
     policy = LearnedAgent(policy) if isinstance(policy, Policy) else policy
-    team = teams_of({"policy": policy}, base.scenario, harm_count=harm_count)["policy"]
+    team = teams_of({"policy": policy}, base.scenario, harm_count=count)["policy"]
     if team.shield is not None:
         raise InvalidInput(f"shield: policy {policy!r:.60} has a shield of its own; pass it without one")
     return with_game(env, around(team).game(game))

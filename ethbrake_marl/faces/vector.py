@@ -23,7 +23,7 @@ from ethbrake_marl.worlds.open_game import AnyScenario
 
 
 class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
-    """Many worlds, each as in ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v2", num_envs=4096)``).
+    """Many worlds, each as in ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v3", num_envs=4096)``).
 
     Row k begins with world k of the seed; every later episode, in any row, takes the next world.
 
@@ -55,7 +55,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str] | None = None,
-        reward: Any = "harm",
+        reward: Any = "shaped",
         observation: Any = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,

@@ -17,7 +17,7 @@ from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.agents.team import Agent, propose
 from ethbrake_marl.episode.commands import actions_of
-from ethbrake_marl.episode.counts import check_count
+from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.play import price
@@ -50,19 +50,20 @@ class EpisodeShield:
 
     Args:
         drivers: the learner's vehicle (1: Vehicle 1) -> its policy.
-        harm_count: harm to compare: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        harm_count: count of harm to compare (``episode.counts``). ``pairwise`` always compares first-impact harm.
         bound: how H*, the harm of E-V2X-BM, is computed: ``coupled`` (the episode's own physics) or ``pairwise`` (the
         paper's closed form).
 
     """
 
     def __init__(
-        self, drivers: Mapping[int, Agent] | None, *, harm_count: str = "first", bound: str = "coupled"
+        self, drivers: Mapping[int, Agent] | None, *, harm_count: AnyCount = HONEST, bound: str = "coupled"
     ) -> None:
-        check_count("shield: harm_count", harm_count)
+        count = HarmCount.of(harm_count, "shield: harm_count")
         if bound not in ("coupled", "pairwise"):
             raise InvalidInput(f"shield: bound = {bound!r}: must be 'coupled' or 'pairwise'")
-        self.drivers, self.count, self.coupled = checked_drivers(drivers), harm_count, bound == "coupled"
+        self.drivers, self.coupled = checked_drivers(drivers), bound == "coupled"
+        self.harm_count = count if self.coupled else FIRST_IMPACTS  # which the closed form predicts
         if len(self.drivers) != 1:
             raise InvalidInput(
                 f"shield: mode 'episode' needs the policy of exactly one learner, not of {len(self.drivers)}; mode"
@@ -75,12 +76,14 @@ class EpisodeShield:
         ((body, agent),) = self.drivers.items()
         remembered = begin_script(game.agents({body: agent})[body], alert, body)
         worlds = alert._replace(wanted=state.wanted)
-        choice = coupled(worlds, body, self.count, state.clock[:, END]) if self.coupled else pairwise(worlds, body)
+        choice = coupled(worlds, body, self.harm_count, state.clock[:, END]) if self.coupled else pairwise(worlds, body)
         backup = actions_of(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
         held_back = constant_plans(game, backup)
         policy_state = state._replace(memories={**state.memories, body: remembered})
-        policy_harm = price(game, state, rollout(game, self.drivers, policy_state, held_back, self.count), self.count)
-        bound_harm = price(game, state, held_back, self.count) if self.coupled else choice.harm
+        policy_harm = price(
+            game, state, rollout(game, self.drivers, policy_state, held_back, self.harm_count), self.harm_count
+        )
+        bound_harm = price(game, state, held_back, self.harm_count) if self.coupled else choice.harm
         nothing = np.zeros((state.n, 1))
         return EpisodeShieldMemory(
             policy_harm <= bound_harm, policy_harm, bound_harm, backup, remembered, nothing, nothing,

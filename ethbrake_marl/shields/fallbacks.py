@@ -14,6 +14,7 @@ import numpy as np
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.team import Agent, propose
 from ethbrake_marl.episode.commands import actions_of
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import choose, descend
 from ethbrake_marl.episode.state import END, STEPS, State
@@ -27,7 +28,7 @@ CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4])  # added to t
 SINGLE_ACTIONS = np.linspace(0.0, -1.0, 4)  # actions of one of several learners, tried while the others follow the plan
 
 
-def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
+def first_plans(game: Game, alert: State, state: State, count: HarmCount) -> list[Floats]:
     """Plans of constant actions from which a shield chooses at the alert, [n, T, L] each.
 
     With one learner: E-V2X-BM. With several: E-V2X-BM of each learner while the others brake fully; the best share of
@@ -53,7 +54,7 @@ def constant_plans(game: Game, actions: Floats) -> Floats:
     return np.repeat(actions[:, np.newaxis], decisions, axis=1)
 
 
-def best_constant(game: Game, states: State, plans: Floats, count: str, below: Floats) -> tuple[Floats, Floats]:
+def best_constant(game: Game, states: State, plans: Floats, count: HarmCount, below: Floats) -> tuple[Floats, Floats]:
     """Constant actions with the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
 
     A candidate is the next actions of ``plans`` [n, T, L] with one of ``CHANGES`` added to all of them. With several
@@ -92,7 +93,7 @@ def write_candidates(car, clock, learners, plans, changes, single_actions, actio
 
 
 def rollout(
-    game: Game, drivers: Mapping[int, Agent], state: State, plans: Floats, count: str, most: Any = np.inf
+    game: Game, drivers: Mapping[int, Agent], state: State, plans: Floats, count: HarmCount, most: Any = np.inf
 ) -> Floats:
     """Copy of ``plans`` [n, T, L] with the actions that agents choose from ``state`` on.
 

@@ -38,7 +38,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.team import Agent, propose
-from ethbrake_marl.episode.counts import check_count
+from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.play import follow_plans
@@ -89,7 +89,7 @@ class StepShield:
     Args:
         drivers: vehicle (1: Vehicle 1) -> agent. They propose where the caller does not, and the shield plans with
             them; None: no agents.
-        harm_count: harm to bound: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        harm_count: count of harm to bound (``episode.counts``).
         allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
         cap: ``baseline``: no vehicle bears more harm than under the best constant actions at the alert; None: no caps.
 
@@ -101,16 +101,16 @@ class StepShield:
         self,
         drivers: Mapping[int, Agent] | None = None,
         *,
-        harm_count: str = "first",
+        harm_count: AnyCount = HONEST,
         allowance: float = 0.0,
         cap: str | None = None,
     ) -> None:
-        check_count("shield: harm_count", harm_count)
         if isinstance(allowance, bool) or not isinstance(allowance, int | float) or not 0.0 <= allowance < np.inf:
             raise InvalidInput(f"shield: allowance = {allowance!r}: must be a finite number, at least 0 m2/s2")
         if cap not in (None, "baseline"):
             raise InvalidInput(f"shield: cap = {cap!r}: must be 'baseline' or None")
-        self.drivers, self.count, self.allowance, self.cap = checked_drivers(drivers), harm_count, float(allowance), cap
+        self.drivers, self.harm_count = checked_drivers(drivers), HarmCount.of(harm_count, "shield: harm_count")
+        self.allowance, self.cap = float(allowance), cap
         self.rests: list[Fallback] = [(CONSTANT, constant)]
         if drivers:
             self.rests.append((POLICY_ROLLOUT, agents_drive))
@@ -128,14 +128,14 @@ class StepShield:
         (m2/s2); the result is then its harm so far. The harm is infinite if a vehicle would bear more than its cap
         (``caps`` [n, N] m2/s2).
         """
-        last, harm = follow_plans(game, states, plans, self.count, most)
+        last, harm = follow_plans(game, states, plans, self.harm_count, most)
         if caps is not None:
-            harm[(last.borne_harm(self.count) > caps).any(axis=1)] = np.inf
+            harm[(last.borne_harm(self.harm_count) > caps).any(axis=1)] = np.inf
         return harm
 
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
         """Copy of ``plans`` in which the shield's agents drive from ``state`` until the harm is above ``most`` [n]."""
-        return rollout(game, self.drivers, state, plans, self.count, most)
+        return rollout(game, self.drivers, state, plans, self.harm_count, most)
 
     def bound(self, memory: StepShieldMemory) -> Floats:
         return np.maximum(memory.price, memory.first + self.allowance) if self.allowance else memory.price
@@ -147,7 +147,7 @@ class StepShield:
         return {body: begin_script(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        return first_plans(game, alert, state, self.count)
+        return first_plans(game, alert, state, self.harm_count)
 
     def cheapest(self, game: Game, states: State, plans: list[Floats]) -> tuple[Floats, Floats]:
         """Plan with the smallest price in each world, [n, T, L], and this price, [n] m2/s2."""
@@ -163,14 +163,14 @@ class StepShield:
         (``possible_states``). ``agents``: vehicle -> memory at the alert.
         """
         plan, harm = self.cheapest(game, states, self.plans(game, alert, state, states))
-        caps = follow_plans(game, state, plan, self.count)[0].borne_harm(self.count) if self.cap else None
+        caps = follow_plans(game, state, plan, self.harm_count)[0].borne_harm(self.harm_count) if self.cap else None
         if agents:
             check_drivers(game, agents)
             agent_plan = self.rolled_out(game, state._replace(memories={**state.memories, **agents}), plan)
             value = self.price(game, states, agent_plan, caps=caps)
             better = value <= harm
             plan[better], harm[better] = agent_plan[better], value[better]
-        last, _ = follow_plans(game, state, plan, self.count)
+        last, _ = follow_plans(game, state, plan, self.harm_count)
         settles: Bools = (last.line[:, SPEED] == 0.0).all(axis=1) & (last.line[:, FORCE] <= 0.0).all(axis=1)
         nothing = np.zeros((state.n, len(game.settings.learners)))
         return StepShieldMemory(
@@ -303,8 +303,8 @@ class StepShield:
         memory: StepShieldMemory = state.memories["shield"]
         borne = {}
         if memory.caps is not None:
-            last, _ = follow_plans(game, state, memory.plan, self.count)
-            borne = {"own_harm": last.borne_harm(self.count), "baseline_own_harm": memory.caps}
+            last, _ = follow_plans(game, state, memory.plan, self.harm_count)
+            borne = {"own_harm": last.borne_harm(self.harm_count), "baseline_own_harm": memory.caps}
         return {
             **borne,
             "bound_harm": self.bound(memory),
@@ -338,8 +338,8 @@ def constant(
     The estimate is 0 (unknown) if scripts look at the state.
     """
     if not game.scripts:
-        return best_constant(game, after, plans, shield.count, below)
-    plans, _ = best_constant(game, after, plans, shield.count, np.full(len(plans), np.inf))
+        return best_constant(game, after, plans, shield.harm_count, below)
+    plans, _ = best_constant(game, after, plans, shield.harm_count, np.full(len(plans), np.inf))
     return plans, np.zeros(len(plans))
 
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import Team
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.evaluate import EPISODES, SEED, evaluate
@@ -159,7 +160,7 @@ def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: 
 
 
 def compared_teams(
-    trained: TrainResult, scenario: Scenario, harm_count: str, baselines: Sequence[str]
+    trained: TrainResult, scenario: Scenario, count: HarmCount, baselines: Sequence[str]
 ) -> Mapping[str, Team]:
     """Teams to compare: the baselines, then the trained policies without and with a shield.
 
@@ -173,7 +174,7 @@ def compared_teams(
         agents[TEAM] = specs
         agents |= {without(vehicle): {**specs, vehicle: FULL_BRAKE.name} for vehicle in specs}
         agents[SHIELDED] = f"{trained.agent}+step"
-    return teams_of(agents, scenario, harm_count=harm_count)
+    return teams_of(agents, scenario, harm_count=count)
 
 
 def without(vehicle: str) -> str:

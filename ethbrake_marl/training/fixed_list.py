@@ -11,7 +11,7 @@ from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import CHUNK, Agent, Team, play_to_end
-from ethbrake_marl.episode.counts import COLUMN
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -35,8 +35,8 @@ def measure_on_list(training: Training) -> Evaluate:
 def drive_list(training: Training) -> Callable[[Mapping[str, Agent]], dict[str, float]]:
     """Function that lets agents (learner -> agent) drive the recipe's fixed list of worlds (key ``evaluation``).
 
-    It returns metrics, which are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost`` (for
-    exact impacts), ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a learner's
+    It returns metrics, which are means over the worlds: the columns of all counts of harm
+    (``total_harm``), ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a learner's
     objective is not the harm of the line, there is also each learner's objective (``objective_vehicle_2``), and their
     mean ``objective``. In a mixture of lines every line has its share of the worlds, and ``relative_NAME`` is what is
     minimised in the line NAME divided by that of full braking; ``objective`` is its mean over the worlds. A metric that
@@ -44,7 +44,8 @@ def drive_list(training: Training) -> Callable[[Mapping[str, Agent]], dict[str, 
     """
     if training.scenario.lines:
         return _drive_lines(training.lines)
-    plan, (scenario, game) = training.recipe.evaluation, open_game(training.scenario)
+    plan, count = training.recipe.evaluation, training.recipe.reward.harm_count
+    scenario, game = open_game(training.scenario, reward={"harm_count": count})
     worlds = scenario.sample(plan.worlds, plan.seed)
     parts = [worlds.take(slice(first, first + CHUNK)) for first in range(0, plan.worlds, CHUNK)]
 
@@ -95,9 +96,8 @@ def _drive_lines(lines: Sequence[Training]) -> Callable[[Mapping[str, Agent]], d
 def metrics_of(training: Training, last: State) -> dict[str, float]:
     """Metrics of ``measure_on_list``, from the last states of the episodes. The count that is minimised comes first."""
     reward, scenario = training.recipe.reward, training.scenario
-    counts = sorted(COLUMN, key=lambda count: count != reward.harm_count)  # what is counted comes first
-    harm_counts = [count for count in counts if count != "honest" or last.is_exact]
-    metrics = {COLUMN[count]: exact_mean(last.harm(count)) for count in harm_counts}
+    counts = dict.fromkeys([reward.harm_count, *last.counts])  # what is counted comes first
+    metrics = {count.column: exact_mean(last.harm(count)) for count in counts}
     metrics["collision_rate"] = float(last.collided.mean())
     metrics["horizon_rate"] = float(last.moving.mean())
     objectives = objectives_of(reward.objective or scenario.objective, scenario.vehicles)
@@ -113,6 +113,6 @@ def exact_mean(values: Floats) -> float:
     return math.fsum(values) / len(values)
 
 
-def deciding(metrics: Mapping[str, float], harm_count: str) -> float:
+def deciding(metrics: Mapping[str, float], count: HarmCount) -> float:
     """Metric by which a training picks its best policy: the lowest value is best. NaN if not measured."""
-    return metrics.get(OBJECTIVE_METRIC, metrics.get(COLUMN[harm_count], np.nan))
+    return metrics.get(OBJECTIVE_METRIC, metrics.get(count.column, np.nan))

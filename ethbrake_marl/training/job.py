@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from ethbrake_marl.episode.counts import COLUMN
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.store import check_folder, hold_lock, remove_unfinished
@@ -17,7 +17,7 @@ from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.train import resume, train
 from ethbrake_marl.training.training import Training
 
-MEASURED = (*COLUMN.values(), "collision_rate")
+MEASURED = (*(count.column for count in BUILT_IN_COUNTS), "collision_rate")
 
 
 @contextmanager

@@ -15,7 +15,16 @@ from pydantic import Field, field_validator, model_validator
 from ethbrake_marl.episode.features import listed_features
 from ethbrake_marl.episode.reward import RewardParams, registered_terms
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.files.model import NAME_PATTERN, FileModel, NonNegative, Positive, Wording, read_model, refuse
+from ethbrake_marl.files.model import (
+    NAME_PATTERN,
+    FileModel,
+    NonNegative,
+    Positive,
+    Wording,
+    read_model,
+    refuse,
+    require,
+)
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.policies.network import Activation, NetworkSpec
 from ethbrake_marl.registry import Registry
@@ -112,7 +121,7 @@ class TrainingRecipe(FileModel):
     total_steps: int = Field(ge=1, description="number of decisions of all learners together")
     n_envs: int = Field(ge=1, description="number of worlds that are simulated together")
     learning_rate: LearningRate = Field(description="learning rate of the optimiser, which falls from start to end")
-    gamma: Fraction = Field(description="discount factor per time step; must be equal to reward.shaping_discount")
+    gamma: Fraction = Field(description="discount factor per time step; at most reward.shaping_discount")
     reward: RewardParams = Field(description="weights and constants of the reward's terms (episode/terms.py)")
     observation: Annotated[tuple[str, ...] | None, Field(strict=False, exclude_if=not_)] = Field(
         None,
@@ -137,6 +146,12 @@ class TrainingRecipe(FileModel):
                 " these terms another weight"
             )
         return value
+
+    @model_validator(mode="after")
+    def _shaping_pays_rightly(self) -> Self:
+        right = self.reward.right_gamma(self.gamma)
+        require(not right, ("gamma",), self.gamma, right)
+        return self
 
     @field_validator("observation", mode="before")
     @classmethod

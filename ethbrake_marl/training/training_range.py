@@ -32,7 +32,7 @@ def record_ranges(policies: Policies, scenario: AnyScenario, worlds: int, seed: 
     lines = load_scenario(scenario).lines or (scenario,)
     observed: dict[int, list[Observations]] = {id(policy): [] for policy in policies.values()}
     for line in lines:
-        loaded, game = open_game(line)
+        loaded, game = open_game(line, reward="harm")  # not used, but defined in every physics
         driven = {body: policies[loaded.vehicle_names[body - 1]] for body in loaded.learners}
         drivers = {body: LearnedAgent(policy.with_range(None)) for body, policy in driven.items()}
         alert = loaded.sample(-(-worlds // len(lines)), seed)

@@ -28,7 +28,7 @@ AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the cont
 def game_of(
     scenario: Scenario,
     scripts: Mapping[int, Script],
-    reward: Reward = "harm",
+    reward: Reward = "honest",
     observation: Any = None,
     reward_vector: Any = None,
     report: Sequence[str] = (),

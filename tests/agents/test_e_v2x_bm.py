@@ -181,10 +181,10 @@ def test_pairwise__refuses_what_the_proof_excludes():
     worlds = wide(3, 3, seed=1)
     backward = worlds.line.copy()
     backward[2, SPEED, 1] = -0.1
-    with pytest.raises(InvalidInput, match=r"^e_v2x_bm:pairwise: a vehicle moves backward in row 2, where the closed"):
+    with pytest.raises(InvalidInput, match=r"^e_v2x_bm:pairwise does not cover backward, by which world 2 departs"):
         pairwise(worlds._replace(line=backward), 2)
     slow = alert([9.0], [20.0, 20.0], brake_rate_mps3=[np.inf, 12.0])
-    with pytest.raises(InvalidInput, match=r"^e_v2x_bm:pairwise: brakes build up gradually in row 0, where the closed"):
+    with pytest.raises(InvalidInput, match=r"^e_v2x_bm:pairwise does not cover build-up, by which world 0 departs"):
         pairwise(slow, 1)
 
 
@@ -203,7 +203,7 @@ def test_coupled__takes_the_middle_of_what_does_no_harm_behind_and_ahead_of_gent
 def test_coupled__stays_off_the_edge_of_a_jump():
     # The least harm, 1.2376, ends at 5.93951 m/s2, from where a second impact makes it 1.6387.
     world = alert([7.59, 9.53], [20.07, 19.34, 20.35], latency_s=[0.0, 0.5, 0.8], **PAPER)
-    best = coupled(world, 2)
+    best = coupled(world, 2, "first")
     around = best.deceleration_mps2[:, np.newaxis] + [-1e-9, 0.0, 1e-9, 3e-5]
     first, _ = harms(world, 2, around, "first", 8.0)[:, 0]
     assert first[:3] == pytest.approx([1.2376] * 3, abs=1e-4) and first[3] > 1.6
@@ -241,7 +241,7 @@ def test_coupled__of_vehicle_1_is_not_worse_than_a_grid_before_an_obstacle():
 def test_coupled__decides_ties_by_the_other_count_then_takes_the_middle():
     worlds = open_game("paper-random-obstacle")[0].sample(300, 3)
     worlds.wanted[:, 2] = -worlds.car[:, BRAKING, 2]
-    best, ties = coupled(worlds, 2), 0
+    best, ties = coupled(worlds, 2, "first"), 0
     grid = worlds.car[:, BRAKING, [2]] * np.linspace(0.0, 1.0, e_v2x_bm.FIRST_PARTS + 1)
     first, total = harms(worlds, 2, grid, "first", 8.0)
     own = harms(worlds, 2, best.deceleration_mps2[:, np.newaxis], "first", 8.0)[1, :, 0]
@@ -310,7 +310,7 @@ def test_agents__have_the_harm_of_the_readme():
     scenario, game = open_game("paper-random")
     worlds, agent = scenario.sample(10_000, 7), make_agent("e_v2x_bm:pairwise")
     last = play_to_end(game, worlds, Team("pairwise", {2: agent}))
-    means = last.harm().mean(), last.harm("total").mean(), last.memories[2].predicted_harm.mean()
+    means = last.harm("first").mean(), last.harm("total").mean(), last.memories[2].predicted_harm.mean()
     assert [f"{mean:.2f}" for mean in means] == ["19.20", "20.68", "9.45"] and agent.knows == STATE
 
 

@@ -184,7 +184,7 @@ def test_torch_module__of_another_type_drives(kind: torch.dtype) -> None:
 
 def test_model__drives_as_in_its_own_librarys_rollout() -> None:
     model = stable.PPO("MlpPolicy", rows(4), n_steps=8, batch_size=16, seed=1).learn(64)
-    env = EthBrakeEnv()
+    env = EthBrakeEnv(reward="harm")
     (seen, _), over, total = env.reset(seed=3), False, 0.0
     while not over:
         seen, reward, terminated, truncated, _ = env.step(predicted(model, seen))
@@ -344,6 +344,29 @@ def test_wrappers_that_change_nothing__are_let_through() -> None:
     env = Monitor(wrappers.RecordEpisodeStatistics(wrappers.TimeLimit(env, 50)))
     trained = stable.PPO("MlpPolicy", env, policy_kwargs=dict(TINY))
     assert harms(policy_agent(trained)) == harms(policy_agent(partial(predicted, trained)))
+
+
+UNDER: dict[str, Callable[[Any], Any]] = {
+    "VecEnv": lambda reward: vec_env.VecMonitor(rows(reward=reward)),
+    "Gymnasium": lambda reward: OwnEnv(reward=reward),
+}
+
+
+@pytest.mark.parametrize("name", UNDER)
+def test_discount_above_that_of_the_shaping__is_refused(name: str) -> None:
+    def driven(gamma: float, reward: Any) -> Any:
+        env = UNDER[name](reward)
+        model = stable.PPO("MlpPolicy", env, n_steps=4, batch_size=4, gamma=gamma, policy_kwargs=dict(TINY))
+        return policy_agent(model, ignore_wrappers=True)
+
+    early = {"harm": 1.0, "shaping": 0.1, "shaping_discount": 0.95}
+    for gamma, reward in ((0.99, "shaped"), (0.95, early), (1.0, {**early, "shaping": 0.0})):
+        assert driven(gamma, reward).name == "PPO"
+    for gamma, reward, most in ((0.99, early, "0.95"), (0.995, "shaped", "0.99")):
+        with refused(
+            f"agent 'PPO': the model was trained with gamma = {gamma}: must be at most {most}, the reward's sh"
+        ):
+            driven(gamma, reward)
 
 
 @pytest.mark.parametrize("algorithm", [stable.PPO, stable.SAC])

@@ -98,11 +98,11 @@ def test_result_that_cannot_be_written__is_an_error_of_one_line(line: str) -> No
     assert ended(line, ">/dev/full") == (3, "", ["ethbrake: error: output: No space left on device"])
 
 
-@pytest.mark.parametrize("line", ["agent list", pytest.param(COAST, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("line", ["scenario list", pytest.param(COAST, marks=pytest.mark.slow)])
 def test_message_that_cannot_be_written__loses_no_result(line: str) -> None:
-    for streams in ("2>&-", "2>/dev/full", "<&-"):
+    for streams in ("<&- 2>&-", "2>/dev/full"):
         status, out, told = ended(line, streams)
-        assert (status, told) == (0, []) and "coast" in out
+        assert (status, told) == (0, []) and len(out) > 100
 
 
 @pytest.mark.parametrize("form", [[], ["--json"]])
@@ -122,10 +122,7 @@ def test_result_in_a_file__may_have_no_stdout(tmp_path: Path) -> None:
     assert (status, out, told) == (0, "", f"results: {tmp_path}/new/results.json")
 
 
-@pytest.mark.parametrize(
-    "line",
-    ["agent list", "--help", *(pytest.param(each, marks=pytest.mark.slow) for each in ("scenario schema", COAST))],
-)
+@pytest.mark.parametrize("line", ["--help", *(pytest.param(each, marks=pytest.mark.slow) for each in LINES)])
 def test_reader_that_goes__is_status_1_without_a_word(line: str) -> None:
     reading, writing = os.pipe()
     os.close(reading)

@@ -21,14 +21,14 @@ def test_harm_count__is_what_agents_lower(ethbrake: Command) -> None:
     assert total["total_harm"] < first["total_harm"] and total["first_impact_harm"] > first["first_impact_harm"]
 
 
-def test_rules__are_short_for_a_count_and_the_honest_ones_show_cost_and_push(ethbrake: Command) -> None:
-    arguments = ("evaluate", "--episodes", "40", "--agents", "full_brake,e_v2x_bm")
-    for rules, count in (("honest", "honest"), ("paper", "first")):
-        long = told_json(ethbrake(*arguments, "--json", "--set", f"harm_count={count}"))
-        assert told_json(ethbrake(*arguments, "--json", "--set", f"rules={rules}")) == long
-        shown = ethbrake(*arguments, "--set", f"rules={rules}").out
-        assert (rules == "honest") == ("Honest Push" in shown) and "First-impact        Total" in shown
-    line = "evaluate --scenario stress --episodes 2 --agents coast --set rules=honest"
+def test_tables__show_all_counts_and_say_which_one_agents_minimise(ethbrake: Command) -> None:
+    arguments = ("evaluate", "--episodes", "40", "--agents", "full_brake,e_v2x_bm,vine-paper")
+    usual, paper = (ethbrake(*arguments, *more).out for more in ((), ("--set", "harm_count=first")))
+    for shown in (usual, paper):
+        assert "First-impact        Total      Honest" in shown
+    assert "Agents minimise honest cost" in usual and "Agents minimise first-impact harm" in paper
+    assert "Push" in usual and "trained for first-impact harm" in usual and "trained for" not in paper
+    line = "evaluate --scenario stress --episodes 2 --agents coast"
     group = ethbrake(*line.split())
     assert "Honest" in group.out and "stress-wide-obstacle" in group.out
 

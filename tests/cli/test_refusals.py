@@ -48,17 +48,16 @@ def test_scenario_command__is_refused(line: str, message: str, refuse: Refuse) -
 
 EVALUATIONS = [
     ("evaluate --set harm_count=both", "harm_count = 'both': must be 'first', 'total' or 'honest'"),
-    ("evaluate --set rules=fair", "--set rules=fair: must be honest or paper"),
-    ("train --set rules=1", "--set rules=1: must be honest or paper"),
+    ("evaluate --set rules=paper", "--set rules=paper: rules has ended; write --set harm_count=first"),
+    ("train --set rules=honest", "--set rules=honest: rules has ended; write --set harm_count=honest"),
     (
-        "evaluate --set rules=honest --set harm_count=total",
-        "--set rules: sets harm_count, which --set harm_count sets, too; leave one of them out",
+        "train --set recipe.reward.harm_count=total --set harm_count=first",
+        "--set harm_count: sets reward.harm_count, which --set recipe.reward.harm_count sets, too; leave one of them",
     ),
     (
-        "train --set recipe.reward.harm_count=total --set rules=paper",
-        "--set rules: sets reward.harm_count, which --set recipe.reward.harm_count sets, too; leave one of them out",
+        "run --set reward=honest --set harm_count=first",
+        "--set harm_count: sets reward.harm_count, which --set reward sets",
     ),
-    ("run --set reward=paper --set rules=paper", "--set rules: sets reward.harm_count, which --set reward sets"),
     ("scenario sample paper-random --set rules=paper", "unknown setting 'rules'"),
     ("evaluate --episodes 100000000000000", "number of worlds = 100000000000000: must be a whole number in 1.."),
     ("evaluate --set recipe.gamma=1", "--set recipe.gamma: this command uses no recipe; remove this setting"),

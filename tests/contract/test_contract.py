@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
+from ethbrake_marl.episode.shaping import potential
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.stream import UnknownResetOption
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -105,7 +107,7 @@ def test_arrays__what_was_returned_never_changes_and_what_was_given_is_left_alon
         # From 0.5 s to the horizon at 0.95 s: four steps of 0.1 s and one of 0.05 s.
         *((name, PAPER.replace(horizon_s=0.95), [0.3] * 15, "....c" * 3) for name in INTERFACES),
         *((name, REST, [-1.0] * 20, ".........r" * 2) for name in INTERFACES),
-        *((name, REST.replace(horizon_s=1.5), [-1.0] * 10, ".........r") for name in INTERFACES),
+        *((name, REST.replace(horizon_s=1.5), [-1.0] * 10, ".........r") for name in BARE),
         # Driving from 1.45 s on: the vehicle rests for an instant only, and the horizon ends the episode.
         *((name, REST.replace(horizon_s=2.0), [-1.0] * 9 + [1.0] * 6, "." * 14 + "c") for name in BARE),
     ],
@@ -123,10 +125,10 @@ def test_end__is_terminated_where_all_rest_and_else_cut_off_at_the_horizon(
     assert told == ends
 
 
-@each_scenario
+@each_interface
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
-def test_clone__in_mid_episode_goes_on_alike_and_apart(name: str, scenario: Scenario, clone: Any) -> None:
-    interface = make(name, scenario)
+def test_clone__in_mid_episode_goes_on_alike_and_apart(name: str, clone: Any) -> None:
+    interface = make(name)
     list(play(interface, 5, steps=10))
     twin = copy.copy(interface)
     twin.env = clone(interface.env)
@@ -137,7 +139,7 @@ def test_clone__in_mid_episode_goes_on_alike_and_apart(name: str, scenario: Scen
 @pytest.mark.parametrize(
     ("scenario", "reward"),
     [
-        *((scenario, reward) for scenario in SCENARIOS.values() for reward in ("harm", "total-harm", "paper")),
+        *((scenario, reward) for scenario in SCENARIOS.values() for reward in ("harm", "total-harm", "paper-reward")),
         *((scenario, "harm") for scenario in LEVELS.values() if len(scenario.learners) == 1),
         *((line(2).with_learners([learner]), "harm") for learner in ("vehicle_1", "vehicle_2")),
     ],
@@ -148,6 +150,21 @@ def test_interfaces__agree_on_every_episode(scenario: Scenario, reward: str) -> 
     assert sum(turn.ended.sum() for turn in runs["single"]) >= 2
     assert any(turn.reward[0] != 0.0 for turn in runs["single"]) or scenario not in SCENARIOS.values()
     assert {name: bits(turns) for name, turns in runs.items()} == dict.fromkeys(BARE, bits(runs["single"]))
+
+
+@each_bare
+@pytest.mark.parametrize("action", [-1.0, -0.3, 0.5])
+def test_default_reward__is_the_scaled_honest_cost_and_in_sum_a_constant_of_the_world(name: str, action: float) -> None:
+    game, interface, given = open_game(PAPER, reward="honest")[1], BARE[name](PAPER, 1), [[action]]
+    state, total, factor = game.reset(PAPER.sample(4, seed=7).take([3])), 0.0, 1.0
+    interface.reset(options={"listed_world": {"seed": 7, "number": 3}})
+    constant = -0.05 * potential(game.settings, state)[0]
+    while not state.ended[0]:
+        state, step = game.step(state, np.array(given))
+        turn = interface.step(np.array(given, np.float32))
+        total += factor * (turn.reward[0] + 0.05 * step.cost[0])
+        factor *= 0.99
+    assert turn.ended[0] and constant > 0.1 and total == pytest.approx(constant, abs=1e-5)
 
 
 def test_interfaces__agree_behind_the_shield_and_differ_from_the_bare_ones() -> None:

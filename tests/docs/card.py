@@ -57,8 +57,9 @@ to `front_64` and `rear_2` to `rear_64` are vehicles farther away. More numbers,
 
 ## Reward
 
-By default `r = - sum w^2` for every vehicle, over the first impacts of all pairs in the step, with the
-closing speed `w` in m/s. In general `r = sum weight x term`:
+The discount of a training must be at most the reward's `shaping_discount`
+([why](../environments.md#rewards)). The reward is `r = sum weight x term`. The default is `shaped`, with
+the discount 0.99:
 
 {rewards}
 
@@ -66,7 +67,7 @@ closing speed `w` in m/s. In general `r = sum weight x term`:
 
 [Counts of harm](../game.md#three-counts-of-harm). Rewards are large before a policy has learned
 anything (honest cost of random actions on `paper-random`: about 550 m²/s² an episode; full braking:
-31), so most learners need a scale, for instance `reward={{"harm": 0.05, "harm_count": "honest"}}`.
+31), so most learners need the scale of `shaped`.
 
 ## Start and end
 
@@ -87,7 +88,8 @@ The same keys after a reset and after every step:
 
 ## Versions
 
-`EthBrake-v2`: [what has changed](../../CHANGELOG.md). `EthBrake-v1`: in version 1.0 of this package.
+`EthBrake-v3`: [what has changed](../../CHANGELOG.md). `EthBrake-v2`: in version 2.0 of this package;
+`EthBrake-v1`: in version 1.0.
 """
 
 
@@ -157,7 +159,7 @@ def page() -> str:
     env = eb.EthBrakeEnv()
     rewards = [
         [f"`{name}`", ", ".join(f"{weight:g} `{term}`" for term, weight in params.weights.items() if weight),
-         f"`{params.harm_count}`"]
+         f"`{params.harm_count.name}`"]
         for name, params in REWARDS.items()
     ]  # fmt: skip
     return TEXT.format(

@@ -35,13 +35,13 @@ class Shown:
 
 _HONEST = tuple(
     f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo,"
-    "universal,best_harm --set rules=honest --set measures=pushed_mps --json"
+    "universal,best_harm --set measures=pushed_mps --json"
     for test in ("", "-brake-only", "-obstacle")
 )
 TABLES: dict[str, tuple[str, ...]] = {
     "| who drives Vehicle 2 | knows | main test": _HONEST,
     "| who drives Vehicle 2 | knows | collisions | first-impact harm | total harm | honest cost": _HONEST,
-    "| agent | what it does | knows": ("ethbrake evaluate --agents ladder --set rules=honest --json",),
+    "| agent | what it does | knows": ("ethbrake evaluate --agents ladder --json",),
 }
 
 PICTURES: dict[str, tuple[str, ...]] = {

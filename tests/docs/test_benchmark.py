@@ -66,7 +66,7 @@ def test_benchmark__prints_a_row_for_each_task_and_writes_it(ethbrake: Command, 
         assert row["share_of_possible_reduction_honest"] == 0.0 or row["agent"] != "full_brake"
     chosen = [row["honest_cost"] for row in printed if row["agent"] == "e_v2x_bm"]
     again = told_json(ethbrake("evaluate", "--scenario", "cooperation-4-all", "--episodes", "40", "--agents",
-                               "e_v2x_bm", "--set", "rules=honest", "--json"))  # fmt: skip
+                               "e_v2x_bm", "--json"))  # fmt: skip
     assert again[0]["honest_cost"] == chosen[0]  # by default agents minimise the honest cost
     shown = ethbrake(*words, "--agents", "coast", "--force").out
     assert "benchmark-truck" in shown and "Possible" in shown

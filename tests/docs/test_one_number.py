@@ -20,7 +20,7 @@ AGENTS = {
 }
 CHOOSE = ("e_v2x_bm", "best_harm")  # what they do depends on what they minimise
 COUNT = re.compile(r"(?i)(first)-impact|(total)|(honest)")
-LEAST = re.compile(r"(?:minimises?|harm_count=|rules=)\W*(?:the )?\W*(first|total|honest)")
+LEAST = re.compile(r"(?:minimises?|harm_count=)\W*(?:the )?\W*(first|total|honest)")
 TEST = re.compile(
     r"(?i)(main|obstacle|brake-only) test|((?:paper|cooperation|realistic|stress|recorded|benchmark)-[\w-]+|rainy)"
 )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agent_names import make_agent, open_game
-from ethbrake_marl.episode.counts import COUNTED_ROWS, COUNTS, pair_amounts
+from ethbrake_marl.episode.counts import COUNTED_ROWS, COUNTS, EXACT_IMPACTS, HONEST, HarmCount, pair_amounts
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.objectives import amounts, objectives_of
@@ -49,15 +49,15 @@ def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_h
     assert state.harm("honest").tolist() == near([counted])
     expected = [0.75 * 36.0 + 18.05**2, 0.25 * 36.0 + 10 * 1.8 + 18.05**2]
     assert state.borne_harm("honest")[0].tolist() == near(expected) and borne.tolist() == near(expected)
-    assert amounts(objectives_of("own", 2), None, state, "honest")[0].tolist() == near(expected)
+    assert amounts(objectives_of("own", 2), None, state, HONEST)[0].tolist() == near(expected)
 
 
 def test_honest__adds_nothing_to_a_line_that_brakes_to_rest_and_prices_driving_there() -> None:
     _, game = open_game(REST)
     alert = game.reset(game.draw(1, 0, 0))
-    last, cost = follow_plans(game, alert, np.full((1, 1, 1), -1.0), "honest")
+    last, cost = follow_plans(game, alert, np.full((1, 1, 1), -1.0), HONEST)
     assert last.at_rest.tolist() == [True] and cost.tolist() == [0.0] and not last.line[:, MOVING].any()
-    last, cost = follow_plans(game, alert, np.array([[[0.5], [0.5], [-1.0]]]), "honest")  # 3 m/s2 for 0.2 s
+    last, cost = follow_plans(game, alert, np.array([[[0.5], [0.5], [-1.0]]]), HONEST)  # 3 m/s2 for 0.2 s
     assert last.harm("total").tolist() == [0.0] and cost.tolist() == near([10 * 0.6])
     assert last.borne_harm("honest")[0].tolist() == [0.0, cost[0]]
 
@@ -73,11 +73,11 @@ def test_amounts__of_pairs_and_worlds_have_the_weights_of_the_count() -> None:
     state = state_of([5.0, 5.0], [1.0, 1.0, 1.0])
     state.line[0, COUNTED_ROWS] = np.arange(1.0, 7.0)[:, np.newaxis] * [1.0, 10.0, 100.0, 0.0]
     for count, weight in (("first", 1.0), ("total", 2.0), ("honest", 2.0 + 3.0 + 40.0 + 50.0 + 6.0)):
-        assert pair_amounts(state.line, count)[0, 0].tolist() == [weight, 10.0 * weight, 100.0 * weight, 0.0]
+        assert pair_amounts(state.line, COUNTS[count])[0, 0].tolist() == [weight, 10.0 * weight, 100.0 * weight, 0.0]
         assert state.harm(count).tolist() == [111.0 * weight]
         assert state.pair_harm(count).tolist() == [[10.0 * weight, 100.0 * weight]]
-    own = np.array([0.5, 0.0, 0.0, 0.0, 2.0, 0.0])
-    assert state.harm(own).tolist() == [111.0 * 10.5] and state.harm(COUNTS["honest"]) == state.harm("honest")
+    own = HarmCount("own", np.array([0.5, 0.0, 0.0, 0.0, 2.0, 0.0]), "own_cost", "own cost", (EXACT_IMPACTS,))
+    assert state.harm(own).tolist() == [111.0 * 10.5] and state.harm() == state.harm(HONEST) == state.harm("honest")
 
 
 # ---------------------------------------------------------------- in random worlds
@@ -138,7 +138,7 @@ def test_hold__of_constant_commands_is_the_episode(name: str) -> None:
     tried = shares[:, np.newaxis] * np.where(shares[:, np.newaxis] < 0.0, braking, driving)
     held = hold(state, state.wanted, learners, tried, game.settings.horizon_s, "honest")
     for c, share in enumerate(shares):
-        last, cost = follow_plans(game, state, np.full((N, 1, len(learners)), share), "honest")
+        last, cost = follow_plans(game, state, np.full((N, 1, len(learners)), share), HONEST)
         assert held[0, :, c] == near(cost, rel=1e-7, abs=1e-7)
         assert held[1, :, c] == near(last.harm("first"), rel=1e-7, abs=1e-7)
 
@@ -161,4 +161,6 @@ def test_other_count__is_refused_and_the_three_are_listed(message: str) -> None:
         UNKNOWN[message]()
     for count in COUNTS:
         assert count in str(error.value)
-    assert RewardParams(harm_count="honest").harm_count == "honest"
+    assert (
+        RewardParams(harm_count="honest").harm_count == HONEST and RewardParams().model_dump()["harm_count"] == "honest"
+    )

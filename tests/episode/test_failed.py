@@ -18,10 +18,10 @@ from ethbrake_marl.motion.layout import GAP, SPEED
 N, PLANTED = 5, 3
 
 
-def planted(state: State) -> State:
+def planted(state: State, row: int = PLANTED) -> State:
     """Worlds, in one of which vehicles 2 and 3 overlap by 1 m when vehicle 2 meets vehicle 1."""
     line = state.line.copy()
-    line[PLANTED, GAP, 1:3], line[PLANTED, SPEED, 1:] = (0.5, -1.0), (10.0, 20.0, 16.0)
+    line[row, GAP, 1:3], line[row, SPEED, 1:] = (0.5, -1.0), (10.0, 20.0, 16.0)
     return state._replace(line=line)
 
 

@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agent_names import open_game
+from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.reward import REWARDS, Rewarding, RewardParams, WithoutEffect, reward_params
+from ethbrake_marl.episode.shaping import potential
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import COST, Step
-from ethbrake_marl.episode.terms import potential, register_term
-from ethbrake_marl.errors import FreeImpacts
+from ethbrake_marl.episode.terms import register_term
+from ethbrake_marl.errors import FreeImpacts, InvalidInput
 from ethbrake_marl.motion.layout import BRAKING, FIRST, GAP, SPEED, TOTAL
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.scenario import Scenario
@@ -39,7 +41,7 @@ def paid(reward: dict[str, Any], before: State, after: State, **settings: Any) -
         reward, "total", after.vehicles, LEARNERS, (0.5, 8.0), settings.pop("vector", None)
     )
     step = step_between(before, after, **settings)
-    step.out[COST] = harm = after.harm(step_settings.weights) - before.harm(step_settings.weights)
+    step.out[COST] = harm = after.harm(step_settings.harm_count) - before.harm(step_settings.harm_count)
     compiled = (step_settings.terminal * step.safe_end - step_settings.harm * harm)[:, np.newaxis]
     return rewarding.complete(before, step._replace(reward=np.repeat(compiled, after.vehicles, axis=1)), after)[1]
 
@@ -215,23 +217,27 @@ def rewards(reward: Any, scenario: Any = "paper-random", n: int = 40) -> tuple[n
 def test_objective__is_the_scenarios_unless_the_reward_has_its_own() -> None:
     own = load_scenario("paper-random").replace(objective="own")
     plain = rewards("harm")[0]
-    assert rewards("harm", own)[0].tolist() == rewards({"harm": 1.0, "objective": "own"})[0].tolist() != plain.tolist()
-    assert rewards({"harm": 1.0, "objective": "total"}, own)[0].tobytes() == plain.tobytes()
-    assert rewards(RewardParams(objective=("total",) * 3))[0].tobytes() == plain.tobytes()
+    assert (
+        rewards("harm", own)[0].tolist()
+        == rewards({"harm": 1.0, "harm_count": "first", "objective": "own"})[0].tolist()
+        != plain.tolist()
+    )
+    assert rewards({"harm_count": "first", "harm": 1.0, "objective": "total"}, own)[0].tobytes() == plain.tobytes()
+    assert rewards(RewardParams(harm_count="first", objective=("total",) * 3))[0].tobytes() == plain.tobytes()
 
 
 def test_objective__changes_no_weight_and_no_other_term() -> None:
-    doubled, _ = rewards({"objective": "maximin", "harm": 2.0, "terminal": 3.0}, n=150)
-    single, state = rewards({"objective": "maximin", "harm": 1.0}, n=150)
+    doubled, _ = rewards({"objective": "maximin", "harm": 2.0, "harm_count": "first", "terminal": 3.0}, n=150)
+    single, state = rewards({"objective": "maximin", "harm": 1.0, "harm_count": "first"}, n=150)
     safe = ~state.collided
-    assert safe.any() and single[:, 0] == near(-amounts(objectives_of("maximin", 3), None, state, "first")[:, 0])
+    assert safe.any() and single[:, 0] == near(-amounts(objectives_of("maximin", 3), None, state, FIRST_IMPACTS)[:, 0])
     assert doubled == near(2.0 * single + 3.0 * safe[:, np.newaxis])
 
 
 def test_objective__without_a_weight_of_harm_has_no_effect_and_warns() -> None:
     own = load_scenario("cooperation-3-pair").replace(objective="own")
     with pytest.warns(WithoutEffect, match="the scenario's objective, own, has no effect"):
-        _, game = open_game(own, reward="paper")
+        _, game = open_game(own, reward="paper-reward")
     assert game.settings.harm == 0.0 and "harm" not in game.rewarding.counted
     open_game(own, reward={"harm": 1.0, "risk": 0.1})
 
@@ -275,13 +281,21 @@ def test_objective__does_not_warn_where_every_impact_counts_or_an_objective_mean
 
 def test_named_rewards__are_those_of_the_page() -> None:
     assert {
+        "shaped": RewardParams(harm=0.05, harm_count="honest", shaping=0.05, shaping_discount=0.99),
         "harm": RewardParams(harm=1.0, harm_count="first"),
         "total-harm": RewardParams(harm=1.0, harm_count="total"),
         "honest": RewardParams(harm=1.0, harm_count="honest"),
-        "paper": RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
+        "paper-reward": RewardParams(harm=0.0, harm_count="first", collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
     } == REWARDS
     assert reward_params({"harm": 2, "jerk": 0.5}) == RewardParams(harm=2.0, jerk=0.5)
-    assert reward_params("paper") is REWARDS["paper"]
+    assert reward_params("paper-reward") is REWARDS["paper-reward"]
+    assert (
+        RewardParams(harm=2.0)
+        == RewardParams(harm=2.0, harm_count="honest")
+        == RewardParams(harm=2.0, harm_count=HONEST)
+    )
+    with pytest.raises(InvalidInput, match=r"^reward 'paper' has ended; write paper-reward"):
+        reward_params("paper")
 
 
 def one(before: State, step: Step, after: State) -> np.ndarray:

@@ -65,7 +65,7 @@ def test_step__of_three_vehicles_has_the_bits_of_the_text_for_any_number() -> No
         for _ in range(40):
             assert step_worlds(
                 line, clock, wanted, False, 0, N, line, car, clock, wanted, actions, scratch, out, reward,
-                settings.learners, settings.time_step_s, settings.harm, settings.terminal, settings.weights,
+                settings.learners, settings.time_step_s, settings.harm, settings.terminal, settings.harm_count.weights,
             ) == (-1, -1)  # fmt: skip
         return line, clock, wanted, out, reward
 
@@ -82,10 +82,11 @@ def test_step__moves_no_world_if_the_action_of_another_slice_is_bad() -> None:
     assert_same(state[:5], before[:5])
 
 
-def test_step__names_the_world_of_any_slice_that_failed() -> None:
-    game = game_with(2)
-    state = planted(game.reset(game.draw(N, 5, 10)))
-    with pytest.raises(PhysicsError, match=r"^world 13: "):
+@pytest.mark.parametrize("row", [3, 100, N - 1])
+def test_step__names_the_world_of_any_slice_that_failed(row: int) -> None:
+    game = game_with(3)
+    state = planted(game.reset(game.draw(N, 5, 10)), row)
+    with pytest.raises(PhysicsError, match=rf"^world {10 + row}: "):
         game.step(state, np.zeros((N, 1)))
 
 

@@ -18,7 +18,7 @@ from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.e_v2x_bm import EV2XBM
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.team import Team
-from ethbrake_marl.episode.counts import COLUMN
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.terms import TERMS, register_term
@@ -71,7 +71,7 @@ def test_objectives__are_measured_in_every_count_and_once_unless_vehicles_differ
 def test_worst5__is_the_mean_of_the_worst_worlds_in_every_count() -> None:
     result = eb.evaluate("paper-random", "full_brake", episodes=100, measures="worst5", harm_count="honest")
     (row,) = eb.summarise(result)
-    for count, column in COLUMN.items():
+    for count, column in ((each, each.column) for each in BUILT_IN_COUNTS):
         last_five = np.sort(result["full_brake"][column])[-5:]
         assert row[f"worst5_{count}"].value == pytest.approx(last_five.mean()) and row[f"worst5_{count}"].interval
 

@@ -14,6 +14,7 @@ import ethbrake_marl as eb
 from ethbrake_marl import parallel
 from ethbrake_marl.agent_names import AGENTS, WRAPPERS
 from ethbrake_marl.cli.app import Installed, run_command, whole_command
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.features import FEATURES
 from ethbrake_marl.episode.objectives import OBJECTIVES
 from ethbrake_marl.episode.terms import TERMS
@@ -150,7 +151,7 @@ def test_entry_point__is_loaded_once_by_several_threads(install: Install) -> Non
 def test_entry_point__that_fails_is_named_and_breaks_nothing_else(
     install: Install, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    tables = (AGENTS, WRAPPERS, MEASURES, TERMS, FEATURES, OBJECTIVES, ALGORITHMS)
+    tables = (AGENTS, WRAPPERS, MEASURES, TERMS, FEATURES, OBJECTIVES, ALGORITHMS, COUNTS)
     groups = {table.group: {f"hills{k}": "broken:part"} for k, table in enumerate(tables)}  # type: ignore[attr-defined]
     install("broken", "import nothing_of_this_name\n", **groups, commands={"hills": "broken:part"})
     told = "broken:part of the installed package broken: cannot be imported: ModuleNotFoundError: No module named"
@@ -162,6 +163,7 @@ def test_entry_point__that_fails_is_named_and_breaks_nothing_else(
         lambda: eb.View(["hills4"]),
         lambda: eb.load_scenario("paper-random").replace(objective="hills5"),
         lambda: eb.load_recipe("ppo").replace(algorithm="hills6"),
+        lambda: eb.make_agent("coast", harm_count="hills7"),
     ):
         with pytest.raises(InvalidInput, match=told):
             use()

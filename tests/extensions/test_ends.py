@@ -39,5 +39,7 @@ def test_plans_and_searches__end_where_the_game_does() -> None:
     assert ends[0].harm("honest").tolist() == ends[1].harm("honest").tolist()
     state = env.game.reset(worlds)
     assert price(env.game, state, np.zeros((20, 1, 1)), "honest").tolist() == ends[0].harm("honest").tolist()
-    best = [best_harm(game, worlds, counts=["honest"], budget=50).harm for game in (env.game, eb.open_game(shorter)[1])]
+    best = [
+        best_harm(game, worlds, harm_counts=["honest"], budget=50).harm for game in (env.game, eb.open_game(shorter)[1])
+    ]
     assert best[0]["honest"].tolist() == best[1]["honest"].tolist()

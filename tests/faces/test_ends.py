@@ -77,8 +77,9 @@ def test_most_steps__are_a_shorter_horizon_at_every_interface(name: str) -> None
     assert runs[0] == runs[1]
 
 
-@pytest.mark.parametrize("name", BARE)
-@pytest.mark.parametrize("most", [10, 11, 10**9, 2**70])
+@pytest.mark.parametrize(
+    ("name", "most"), [("single", 11), ("single", 10**9), *((name, most) for name in BARE for most in (10, 2**70))]
+)
 def test_most_steps__that_are_not_reached_change_nothing(name: str, most: int) -> None:
     runs = []
     for settings in ({NAMES.get(name, "max_cycles"): most}, dict[str, Any]()):
@@ -113,7 +114,7 @@ def test_most_steps__from_each_world_s_own_first_decision() -> None:
 
 def test_terminal__is_paid_by_hand_and_through_gymnasium() -> None:
     register_environments()
-    env = gymnasium.make("EthBrake-v2", scenario="paper-random", reward={"harm": 0, "terminal": 1}, max_cycles=2)
+    env = gymnasium.make("EthBrake-v3", scenario="paper-random", reward={"harm": 0, "terminal": 1}, max_cycles=2)
     env.reset(seed=7)
     assert [env.step([0.0])[1:4] for _ in range(2)] == [(0.0, False, False), (1.0, False, True)]
     crash = eb.EthBrakeEnv(CRASH, reward={"harm": 1, "harm_count": "honest"}, max_cycles=4)

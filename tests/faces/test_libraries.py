@@ -45,7 +45,7 @@ from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 from ethbrake_marl.worlds.catalogue import load_scenario
 
 SETTINGS: list[dict[str, Any]] = [
-    {"scenario": "paper-random-obstacle", "agents": "learners"}, {"actions": 5, "reward": "paper"},
+    {"scenario": "paper-random-obstacle", "agents": "learners"}, {"actions": 5, "reward": "paper-reward"},
     {"scenario": "mixture-delays", "max_cycles": 7},
 ]  # fmt: skip
 
@@ -71,8 +71,8 @@ def test_gymnasium_and_stable_baselines3__find_nothing_wrong(settings: dict[str,
 def test_ids__make_the_environments_of_each_library() -> None:
     register_environments()
     register_environments()  # has no effect
-    single = gymnasium.make("EthBrake-v2", scenario="paper-random-obstacle", max_episode_steps=3)
-    many = gymnasium.make_vec("EthBrake-v2", 2, max_episode_steps=3, autoreset_mode="SameStep")
+    single = gymnasium.make("EthBrake-v3", scenario="paper-random-obstacle", max_episode_steps=3)
+    many = gymnasium.make_vec("EthBrake-v3", 2, max_episode_steps=3, autoreset_mode="SameStep")
     vectors = gymnasium.make("EthBrakeMO-v1")
     assert type(single.unwrapped) is type(vectors.unwrapped) is EthBrakeEnv and type(many) is EthBrakeVectorEnv
     for env, action in ((single, np.zeros(1, np.float32)), (many, np.zeros((2, 1)))):
@@ -81,7 +81,7 @@ def test_ids__make_the_environments_of_each_library() -> None:
     vectors.reset(seed=1)
     assert vectors.step([0.0])[1].shape == vectors.unwrapped.reward_space.shape == (3,)
     for interface in ("parallel", "aec") if hasattr(pettingzoo, "make") else ():
-        assert type(pettingzoo.make(interface, "ethbrake/ethbrake-v2").unwrapped) is EthBrakeParallelEnv
+        assert type(pettingzoo.make(interface, "ethbrake/ethbrake-v3").unwrapped) is EthBrakeParallelEnv
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -101,7 +101,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "content": {"scenario": {**CONTENT, "mass_t": np.array([1.0, 2.0, 3.0]), "gaps_m": {"choice": (7, np.float32(8))}}},
     "reward": {"reward": {"harm": np.float32(0.3), "jerk": np.float64(1e-5), "objective": ("own", "own", "own")}},
     "params": {"reward": RewardParams(harm=0.5, collision=0.1, k_energy=(1.0, 2.0))},
-    "names": {"reward": np.str_("paper"), "learners": np.array(["vehicle_3"])},
+    "names": {"reward": np.str_("paper-reward"), "learners": np.array(["vehicle_3"])},
     "view": {"observation": {"vehicle_2": View(["own", "rear_1.gap"])}, "learners": ("vehicle_2",)},
     "features": {"observation": ("own", "front_1")},
     "set": {"learners": {"vehicle_2"}, "render_mode": np.str_("ansi")},
@@ -126,8 +126,8 @@ def played(env: Any, n: int | None = None) -> list[Any]:
 @pytest.mark.parametrize("given", ARGUMENTS.values(), ids=ARGUMENTS)
 def test_spec__every_argument_goes_through_json_and_makes_the_same_episode(given: Any, empty_folder: Path) -> None:
     empty_folder.joinpath("mine.yaml").write_text(json.dumps({**CONTENT, "name": "mine", "horizon_s": 5.0}))
-    single = gymnasium.make("EthBrake-v2", **given)
-    many = gymnasium.make_vec("EthBrake-v2", 2, autoreset_mode=AutoresetMode.SAME_STEP, **given)
+    single = gymnasium.make("EthBrake-v3", **given)
+    many = gymnasium.make_vec("EthBrake-v3", 2, autoreset_mode=AutoresetMode.SAME_STEP, **given)
     same = gymnasium.make(EnvSpec.from_json(single.spec.to_json()))
     alike = gymnasium.make_vec(EnvSpec.from_json(many.spec.to_json()))
     first, rows = played(single), played(many, 2)
@@ -149,7 +149,7 @@ LATER = {
      ("paper-random-obstacle", "vehicle_1", 80, 80)],
 )  # fmt: skip
 def test_spec__states_the_longest_episode_in_steps(scenario: Any, learner: str, steps: int, least: int) -> None:
-    env = gymnasium.make("EthBrake-v2", scenario=scenario, learners=[learner])
+    env = gymnasium.make("EthBrake-v3", scenario=scenario, learners=[learner])
     assert env.spec.max_episode_steps == env.unwrapped.spec.max_episode_steps == steps
     taken, driving = [], np.ones(1, np.float32)
     for seed in range(8):
@@ -159,8 +159,8 @@ def test_spec__states_the_longest_episode_in_steps(scenario: Any, learner: str, 
     timed = TimeAwareObservation(env)
     assert timed.reset(seed=1)[0] in timed.observation_space
     for limit in (3, steps):
-        limited = gymnasium.make("EthBrake-v2", max_episode_steps=limit)
-        vector = gymnasium.make_vec("EthBrake-v2", num_envs=2, max_episode_steps=limit)
+        limited = gymnasium.make("EthBrake-v3", max_episode_steps=limit)
+        vector = gymnasium.make_vec("EthBrake-v3", num_envs=2, max_episode_steps=limit)
         assert limited.spec.max_episode_steps == limit and vector.spec.max_episode_steps == min(limit, 75)
     assert EthBrakeEnv().spec is None and "TimeLimit" not in str(env)
 
@@ -259,7 +259,7 @@ REFUSED: list[Callable[[], Any]] = [
     lambda: EthBrakeVectorEnv(4, scenario="nope"), lambda: EthBrakeVectorEnv(0),
     lambda: EthBrakeVectorEnv(2, render_mode="human"), lambda: EthBrakeVectorEnv(2, actions=1),
     lambda: EthBrakeEnv("nope"), lambda: EthBrakeParallelEnv("nope"), lambda: raw_env("nope"),
-    lambda: gymnasium.make_vec("EthBrake-v2", 2, scenario="nope"), lambda: make_sb3_vec_env("nope", 2),
+    lambda: gymnasium.make_vec("EthBrake-v3", 2, scenario="nope"), lambda: make_sb3_vec_env("nope", 2),
 ]  # fmt: skip
 
 

@@ -35,7 +35,7 @@ def began(**settings: Any) -> EthBrakeParallelEnv:
 
 
 def test_crash__by_hand() -> None:
-    env = began(scenario=CRASH)
+    env = began(scenario=CRASH, reward="harm")
     seen = [env.step({"vehicle_1": [1.0], "vehicle_2": [0.0]}) for _ in range(8)]  # from 0.5 s to the horizon at 1.3 s
     harm = [rewards["vehicle_1"] for _, rewards, *_ in seen]
     assert harm[:4] == [0.0] * 4 and sum(harm) == pytest.approx(-36.0)
@@ -73,7 +73,7 @@ def test_max_cycles__truncates_only_what_has_not_come_to_rest() -> None:
 
 
 def test_vector_rewards__are_the_harm_that_each_vehicle_bears() -> None:
-    env, scalar = began(scenario=CRASH, reward_vector="vehicles"), began(scenario=CRASH)
+    env, scalar = (began(scenario=CRASH, reward="harm", **more) for more in ({"reward_vector": "vehicles"}, {}))
     paid = []
     for _ in range(8):
         rewards, numbers = env.step({"vehicle_2": [0.0]})[1], scalar.step({"vehicle_2": [0.0]})[1]

@@ -45,8 +45,11 @@ def of(values: list[Any], name: str) -> list[Any]:
     return [{agent: info[f"reward_{name}"] for agent, info in infos.items()} for _, infos in values[1:]]
 
 
-@pytest.mark.parametrize("scenario", [LATE, FIVE.replace(horizon_s=1.2), CRASH], ids=lambda scenario: scenario.name)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("scenario", "name"),
+    [*((FIVE.replace(horizon_s=1.2), name) for name in NAMES), *((line, "harm") for line in (LATE, CRASH))],
+    ids=lambda value: value if isinstance(value, str) else value.name,
+)
 def test_report__is_the_term_that_would_be_rewarded(scenario: eb.Scenario, name: str) -> None:
     weights = {"harm": 0.0, "collision": 0.5} | {name: 2.0}
     rewarded = played(eb.parallel_env(scenario, reward=weights))

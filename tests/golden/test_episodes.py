@@ -25,8 +25,8 @@ DIGESTS, NUMBERS = (Path(__file__).with_name(f"episodes.{end}") for end in ("jso
 RECORDED = json.loads(DIGESTS.read_text("utf-8")) if DIGESTS.exists() else {}
 N = 10
 REWARDS: dict[str, Any] = {
-    "paper": "paper",
-    "ppo": {"harm": 0.05, "terminal": 0.02, "shaping": 0.05, "shaping_discount": 0.995},
+    "paper": "paper-reward",
+    "ppo": {"harm": 0.05, "harm_count": "first", "terminal": 0.02, "shaping": 0.05, "shaping_discount": 0.995},
     **{
         objective: {"harm": 1.0, "harm_count": "total", "objective": objective}
         for objective in ("own", "social:45", "maximin", "mass-weighted", "weighted:1,4,1")

@@ -112,7 +112,7 @@ def of_benchmarl(names: dict[str, Any]) -> Any:
 def of_zoo(names: dict[str, Any]) -> Any:
     from stable_baselines3 import PPO
 
-    (file,) = Path("logs").glob("ppo/*/EthBrake-v2.zip")
+    (file,) = Path("logs").glob("ppo/*/EthBrake-v3.zip")
     return PPO.load(file)
 
 
@@ -244,7 +244,7 @@ def evaluated_by_itself(model: Any, agent: Any) -> float:
     scenario = eb.load_scenario(SCENARIO)
     sample = scenario.sample(OWN_EPISODES, SEED, purpose="training")  # the worlds of ``env.reset(seed=SEED)``
     ours = eb.evaluate(sample, {"theirs": agent}, scenario=scenario)["theirs"]["first_impact_harm"]
-    worlds = make_vec_env("EthBrake-v2", seed=SEED, env_kwargs={"actions": getattr(model.action_space, "n", None)})
+    worlds = make_vec_env("EthBrake-v3", seed=SEED, env_kwargs={"actions": getattr(model.action_space, "n", None)})
     returns, _ = evaluate_policy(model, worlds, OWN_EPISODES, deterministic=True, return_episode_rewards=True)
     return float(np.abs(ours + returns).max())
 

@@ -39,18 +39,18 @@ def test_the_harm_is_the_smaller_one_to_the_bit(agent: Agent, name: str, count: 
 
 
 def test_a_better_policy_drives_as_if_alone() -> None:
-    game, alert, team = hybrid(PPO)
+    game, alert, team = hybrid(PPO, harm_count="first")
     last, alone = play_to_end(game, alert, team), play_to_end(game, alert, team._replace(shield=None))
     chosen = last.memories["shield"].chosen
     assert chosen.mean() > 0.9
-    np.testing.assert_allclose(last.harm()[chosen], alone.harm()[chosen], atol=1e-6)
-    assert (last.harm() <= alone.harm() + 1e-6).all()
+    np.testing.assert_allclose(last.harm("first")[chosen], alone.harm("first")[chosen], atol=1e-6)
+    assert (last.harm("first") <= alone.harm("first") + 1e-6).all()
 
 
 def test_h_star_is_that_of_e_v2x_bm() -> None:
     game, alert, team = hybrid(Held("coast"))
     memory = play_to_end(game, alert, team).memories["shield"]
-    np.testing.assert_allclose(memory.bound_harm, coupled(alert, 2, "first", game.settings.horizon_s).harm, atol=1e-6)
+    np.testing.assert_allclose(memory.bound_harm, coupled(alert, 2, "honest", game.settings.horizon_s).harm, atol=1e-6)
     game, alert, team = hybrid(Held("coast"), bound="pairwise")
     memory = play_to_end(game, alert, team).memories["shield"]
     np.testing.assert_array_equal(memory.bound_harm, pairwise(alert, 2).harm)

@@ -16,6 +16,7 @@ from ethbrake_marl.agent_names import make_teams, register_shield
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Team
+from ethbrake_marl.episode.counts import ALL_IMPACTS, FIRST_IMPACTS, HONEST
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
@@ -125,7 +126,7 @@ def test_policies_propose_what_the_caller_leaves_out() -> None:
     env.reset(seed=7)
     infos = env.step({"vehicle_3": [0.5]})[4]
     assert [infos[f"vehicle_{i}"]["shield_proposed_action"] for i in (1, 2, 3)] == [0.0, 0.0, 0.5]
-    gym = shield(EthBrakeEnv("paper-random"), load_shipped("ppo"))
+    gym = shield(EthBrakeEnv("paper-random", reward="harm"), load_shipped("ppo"))
     first = gym.reset(seed=7)[1]["shield_bound_harm"]
     over = False
     while not over:
@@ -138,7 +139,7 @@ def test_policies_propose_what_the_caller_leaves_out() -> None:
 @pytest.mark.parametrize("policy", [None, "ppo"])
 def test_the_bound_holds_where_the_next_step_begins_the_next_episode(policy: Any) -> None:
     """Gymnasium's default: the step after an episode's last one reports the bound of the next one."""
-    env = shield(EthBrakeVectorEnv(8, "paper-random"), policy)
+    env = shield(EthBrakeVectorEnv(8, "paper-random", reward="harm"), policy)
     first, over, episodes = env.reset(seed=1)[1]["shield_bound_harm"].copy(), np.zeros(8, bool), 0
     for _ in range(120):
         *_, ended, cut, infos = env.step(np.full((8, 1), 1.0 if policy is None else np.nan))
@@ -150,7 +151,7 @@ def test_the_bound_holds_where_the_next_step_begins_the_next_episode(policy: Any
 
 
 def test_mode_episode() -> None:
-    env = shield(EthBrakeEnv("paper-random"), "full_brake", "episode", bound="pairwise")
+    env = shield(EthBrakeEnv("paper-random", reward="harm"), "full_brake", "episode", bound="pairwise")
     env.reset(seed=7)
     info = env.step([0.0])[4]
     names = {"chosen_policy", "policy_harm", "bound_harm", "proposed_action", "applied_action", "intervened"}
@@ -161,24 +162,24 @@ def test_teams_and_names() -> None:
     team = Team("coasting", {2: COAST})
     guarded = shield(team, harm_count="total", allowance=1.0)
     assert guarded.name == "coasting+step" and guarded.shield.drivers == {2: COAST}
-    assert (guarded.shield.count, guarded.shield.allowance) == ("total", 1.0)
+    assert (guarded.shield.harm_count, guarded.shield.allowance) == (ALL_IMPACTS, 1.0)
     alone = shield(COAST, scenario="paper-random", mode="episode")
     assert alone.drivers == {2: COAST} and alone.name == "coast+episode"
     scenario = load_scenario("paper-random")
     teams = make_teams("ppo+step,coast+episode:pairwise", scenario, harm_count="total")
     assert [type(each.shield).__name__ for each in teams.values()] == ["StepShield", "EpisodeShield"]
-    assert [each.shield.count for each in teams.values()] == ["total", "total"]
+    assert [each.shield.harm_count for each in teams.values()] == [ALL_IMPACTS, FIRST_IMPACTS]  # the paper's
 
 
 def test_the_count__is_that_of_the_reward_unless_it_is_given() -> None:
     for env, count in (
-        (EthBrakeEnv("paper-random"), "first"),
-        (EthBrakeEnv("paper-random", reward="honest"), "honest"),
+        (EthBrakeEnv("paper-random"), HONEST),
+        (EthBrakeEnv("paper-random", reward="harm"), FIRST_IMPACTS),
     ):
-        assert shield(env).unwrapped.game.shield.count == count
-        assert shield(env, "ppo", "episode").unwrapped.game.shield.count == count
-        assert shield(env, harm_count="total").unwrapped.game.shield.count == "total"
-    assert shield(COAST, scenario="paper-random").shield.count == "first"
+        assert shield(env).unwrapped.game.shield.harm_count == count
+        assert shield(env, "ppo", "episode").unwrapped.game.shield.harm_count == count
+        assert shield(env, harm_count="total").unwrapped.game.shield.harm_count == ALL_IMPACTS
+    assert shield(COAST, scenario="paper-random").shield.harm_count == HONEST
 
 
 def test_a_shield_that_is_registered_for_names_is_a_mode() -> None:

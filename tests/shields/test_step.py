@@ -10,7 +10,7 @@ from ethbrake_marl.agent_names import make_agent, open_game
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Team, play_to_end
-from ethbrake_marl.episode.counts import COUNTS
+from ethbrake_marl.episode.counts import COUNTS, HONEST
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.play import follow_plans, price
@@ -74,7 +74,7 @@ def test_close_behind_a_braking_vehicle__driving_is_replaced() -> None:
 def test_nothing_proposed__the_plan_is_followed_and_costs_its_price() -> None:
     game, state = opened("paper")
     plan, bound = state.memories["shield"].plan, state.memories["shield"].price
-    expected = price(game, state, plan, "first")
+    expected = price(game, state, plan, "honest")
     while not state.ended.all():
         running = ~state.ended
         state, _ = game.step(state, np.full((20, 1), NAN))
@@ -97,10 +97,10 @@ def test_at_the_alert_the_bound_is_the_cheapest_first_plan() -> None:
     scenario, game = open_game(LINES["pair"]())
     alert = scenario.sample(10, 7)
     state = game._replace(shield=StepShield()).reset(alert)
-    harms = [price(game, state, plan, "first") for plan in first_plans(game, alert, state, "first")]
+    harms = [price(game, state, plan, HONEST) for plan in first_plans(game, alert, state, HONEST)]
     assert len(harms) == 4  # E-V2X-BM of each, the descent, full braking; one learner: E-V2X-BM alone
     _, alone = open_game("paper-random")
-    assert len(first_plans(alone, alert, state, "first")) == 1
+    assert len(first_plans(alone, alert, state, HONEST)) == 1
     assert (state.memories["shield"].price == np.min(harms, axis=0)).all()
     assert (state.memories["shield"].price <= harms[-1]).all()
 
@@ -162,7 +162,7 @@ def test_rows_do_not_know_of_each_other() -> None:
 def test_an_allowance_replaces_less() -> None:
     replaced = []
     for allowance in (0.0, 5.0):
-        game, state = opened("paper", 60, allowance=allowance)
+        game, state = opened("paper", 60, allowance=allowance, harm_count="first")
         while not state.ended.all():
             state, _ = game.step(state, np.full((60, 1), -0.2), donate=True)
         replaced.append(state.memories["shield"].replaced.mean())
@@ -206,7 +206,7 @@ def test_proposals_that_are_rejected_together_are_tried_one_by_one_to_the_last_l
             rows = np.flatnonzero(bad[:, column:].all(axis=1))  # this trial was of the plan that stands
             plans = memory.plan[rows].copy()
             plans[np.arange(len(rows)), before.steps[rows], column] = proposed[rows, column]
-            assert (price(game, before.take(rows), plans, "first") > memory.price[rows]).all()
+            assert (price(game, before.take(rows), plans, HONEST) > memory.price[rows]).all()
             rejected[column] += len(rows)
     assert (rejected > 0).all() and (accepted > 0).all()
 
@@ -221,12 +221,12 @@ def shielded(agent: Any, name: str = "paper", n: int = 40, **options: Any) -> tu
 
 
 def test_a_team_better_than_constants_is_left_alone() -> None:
-    game, alert, team = shielded(LearnedAgent(load_shipped("ppo")))
+    game, alert, team = shielded(LearnedAgent(load_shipped("ppo")), harm_count="first")
     last, alone = play_to_end(game, alert, team), play_to_end(game, alert, team._replace(shield=None))
     memory = last.memories["shield"]
-    better = alone.harm() <= memory.first
+    better = alone.harm("first") <= memory.first
     assert better.mean() > 0.9 and (memory.replaced[better] == 0).all()
-    np.testing.assert_allclose(last.harm()[better], alone.harm()[better], atol=1e-6)
+    np.testing.assert_allclose(last.harm("first")[better], alone.harm("first")[better], atol=1e-6)
 
 
 def test_an_agent_worse_than_constants_is_held_to_them() -> None:
@@ -287,8 +287,8 @@ def test_a_script_that_reacts_is_asked_in_every_play() -> None:
     game, state = opened("follower", 40)
     state = game._replace(shield=None).reset(LINES["follower"]().sample(40, 7))
     plan = np.full((40, 90, 1), -1.0)
-    deaf, _ = follow_plans(game._replace(scripts={}), state, plan, "first")
-    heard, harm = follow_plans(game, state, plan, "first")
+    deaf, _ = follow_plans(game._replace(scripts={}), state, plan, HONEST)
+    heard, harm = follow_plans(game, state, plan, HONEST)
     assert (heard.harm() == harm).all() and (deaf.harm() != harm).any()
 
 
@@ -313,8 +313,8 @@ def test_constant_actions_have_the_least_harm_of_all_candidates(name: str) -> No
             candidates.append(planned.copy())
             candidates[-1][:, 0, c] = action
     commands = np.concatenate(candidates, axis=1) * state.braking_capacity_mps2[:, np.newaxis, learners - 1]
-    harm = hold(state, state.wanted, learners, commands, state.clock[:, END], "first")[0]
-    actions, least = best_constant(game, state, plans, "first", unbounded)
+    harm = hold(state, state.wanted, learners, commands, state.clock[:, END], HONEST)[0]
+    actions, least = best_constant(game, state, plans, HONEST, unbounded)
     assert least.tolist() == harm.min(axis=1).tolist()
     assert (actions == np.stack(candidates)[harm.argmin(axis=1), np.arange(30)]).all()
 

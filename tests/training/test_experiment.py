@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import COLUMN
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, HarmCount
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.training.experiment import Experiment, run_experiment
 from ethbrake_marl.training.run import RunFolder
@@ -31,7 +31,7 @@ def status(run: Path) -> dict[str, Any]:
     return content
 
 
-@pytest.mark.parametrize("count", COLUMN)
+@pytest.mark.parametrize("count", [count.name for count in BUILT_IN_COUNTS])
 def test_one_learner__is_compared_alone_and_in_the_hybrid(count: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     found = quick(run, recipe=SHORT.replace(reward={"harm": 1.0, "harm_count": count}))
@@ -41,7 +41,10 @@ def test_one_learner__is_compared_alone_and_in_the_hybrid(count: str, tmp_path: 
     specs = {"e_v2x_bm": "e_v2x_bm", "trained policy": f"policy@{run}", "hybrid": f"policy@{run}+episode"}
     again = eb.evaluate("paper-random", [*specs.values()], episodes=EPISODES, harm_count=count)
     for name, spec in specs.items():
-        assert found.compared.result[name][COLUMN[count]].tolist() == again[spec][COLUMN[count]].tolist()
+        assert (
+            found.compared.result[name][HarmCount.of(count).column].tolist()
+            == again[spec][HarmCount.of(count).column].tolist()
+        )
     saved = eb.read_result(run / "results.json")
     assert [*saved] == names and len((run / "worlds.csv").read_text().splitlines()) == 1 + len(names) * EPISODES
     assert ("pushed_mps" in saved["hybrid"]) == (count == "honest")
@@ -93,7 +96,7 @@ def test_report__gets_the_measures_that_there_are_and_writes_into_the_run(tmp_pa
     assert (found.measures, tables, where) == (("pushed_mps",), ["table"], "there")
     assert found.compared.result.about["seed"] == 3 and "mine.txt" in status(run)["written"]
     (said,) = filter(None, notes)
-    assert said.startswith("e_v2x_bm:pairwise is left out: e_v2x_bm:pairwise: brakes build up gradually")
+    assert said.startswith("e_v2x_bm:pairwise is left out: e_v2x_bm:pairwise does not cover build-up")
 
 
 def test_evaluation__that_is_interrupted_keeps_the_policy_and_says_so(tmp_path: Path) -> None:

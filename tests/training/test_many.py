@@ -26,7 +26,7 @@ pytest.importorskip("optuna")
 Run = Callable[..., int]
 ROOT = Path(__file__).resolve().parents[2]
 RUN = ("benchmark/run", "--tasks", "paper-random", "--seeds", "2", "--episodes", "5", "--methods")
-TUNE = ("tune", "--scenario", "paper-random", "--trials", "3", "--search", "gamma=0.9..1.0:log")
+TUNE = ("tune", "--scenario", "paper-random", "--trials", "3", "--search", "gamma=0.9..0.99:log")
 TUNE += ("n_epochs=1..3", "network.policy=[8]/[16, 8]", "--recipe")
 
 

@@ -69,6 +69,9 @@ REFUSED: dict[str, Callable[[], object]] = {
         "gamma: 0.99\n", ""
     ),
     "mine.yaml, line 9: gamma = 1.1: must be less than or equal to 1": lambda: with_line("0.99", "1.1"),
+    "mine.yaml, line 9: gamma = 0.99: must be at most 0.9, the reward's shaping_discount: a larger": lambda: with_line(
+        "harm: 1", "harm: 1, shaping: 0.1, shaping_discount: 0.9"
+    ),
     "mine.yaml, line 9: gamma = .nan: must be a finite number": lambda: with_line("0.99", ".nan"),
     "mine.yaml, line 6: batch_size = 100: must divide n_envs x n_steps = 512": lambda: with_line("128", "100"),
     "mine.yaml, line 4: n_envs = 999999: n_envs x n_steps = 31999968 decisions": lambda: with_line("16", "999999"),

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import make_teams
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.evaluation.benchmark import COUNT, evaluate_task
+from ethbrake_marl.evaluation.benchmark import evaluate_task
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import check_target, write_file
@@ -33,7 +33,7 @@ def cross_play(task: str, agents: Sequence[str]) -> tuple[list[str], NDArray[Any
     """
     scenario = eb.load_scenario(task)
     front, *others = scenario.learners
-    teams = make_teams(agents, scenario, harm_count=COUNT)
+    teams = make_teams(agents, scenario)
     if not others or len(teams) < 2:
         raise InvalidInput(
             f"cross-play needs two agents or more, and two learners or more; {task} has {1 + len(others)}"

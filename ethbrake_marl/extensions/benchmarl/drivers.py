@@ -11,14 +11,17 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ethbrake_marl.agents.policy_agent import PolicyAgent, policy_agent
 from ethbrake_marl.episode.observe import Observations
+from ethbrake_marl.episode.reward import reward_params
 from ethbrake_marl.extensions.benchmarl.task import GROUP
 
 
 def drivers_of(experiment: Any) -> dict[str, PolicyAgent]:
     """Agents with the deterministic policies of a BenchMARL experiment, vehicle -> agent, for ``eb.evaluate``.
 
-    Every vehicle decides from its own observation alone.
+    Every vehicle decides from its own observation alone. Raises ``InvalidInput`` if the experiment's discount is too
+    large for the shaping of the task's reward.
     """
+    reward_params(experiment.task.config.get("reward", "shaped")).check_gamma(experiment.config.gamma, "config.gamma")
     task, actor = experiment.task, experiment.group_policies[GROUP]
     learners, actions = task.group_map(None)[GROUP], task.config.get("actions")
 

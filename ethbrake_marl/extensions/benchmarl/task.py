@@ -44,7 +44,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         scenario: must have a learner; all its learners must observe the same features.
         n: number of worlds.
         seed: seed of the worlds.
-        reward: a name such as ``harm``, or the weights of the reward's terms.
+        reward: a name such as ``shaped``, or the weights of the reward's terms.
         horizon_is_end: True: an episode that reaches the horizon is terminated; False: it is truncated.
         shield: mode of the learners' shield, such as ``step``. None: no shield.
         actions: number of discrete actions, for algorithms such as QMIX; None: actions are numbers in [-1, 1].
@@ -59,7 +59,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         scenario: AnyScenario,
         n: int,
         seed: int,
-        reward: Any = "harm",
+        reward: Any = "shaped",
         horizon_is_end: bool = True,
         shield: str | None = None,
         actions: int | None = None,
@@ -75,7 +75,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
                 " must have one or more learners, which all observe the same features"
             )
         if shield is not None:
-            game = game._replace(shield=guard_team(NO_TEAM, shield, loaded, "first", {}).shield)
+            game = game._replace(shield=guard_team(NO_TEAM, shield, loaded, game.settings.harm_count, {}).shield)
         self.game = game
         self.stream = Stream(loaded, self.game, chosen_seed(seed))
         rows = n, len(self.learners)

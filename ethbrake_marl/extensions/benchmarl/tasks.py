@@ -36,7 +36,7 @@ class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra 
 
 
 def _settings(scenario: str) -> dict[str, Any]:
-    return {"scenario": scenario, "reward": "harm", "horizon_is_end": True, "shield": None, "actions": None}
+    return {"scenario": scenario, "reward": "shaped", "horizon_is_end": True, "shield": None, "actions": None}
 
 
 def _task_name(scenario: str) -> str:

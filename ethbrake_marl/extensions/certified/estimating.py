@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.team import Agent
+from ethbrake_marl.episode.counts import HONEST, AnyCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import ESTIMATED
 from ethbrake_marl.episode.state import State
@@ -39,7 +40,7 @@ class EstimatedShield(StepShield):
     knows = ESTIMATED
 
     def __init__(
-        self, drivers: Mapping[int, Agent] | None = None, *, scenario: Scenario, harm_count: str = "first"
+        self, drivers: Mapping[int, Agent] | None = None, *, scenario: Scenario, harm_count: AnyCount = HONEST
     ) -> None:
         super().__init__(drivers, harm_count=harm_count)
         self.line = line_of_learner(scenario)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.team import Agent
+from ethbrake_marl.episode.counts import HONEST, AnyCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.layer import MODEL
@@ -49,7 +50,7 @@ class RobustShield(StepShield):
         drivers: Mapping[int, Agent] | None = None,
         *,
         uncertainty: str | None = None,
-        harm_count: str = "first",
+        harm_count: AnyCount = HONEST,
         allowance: float = 0.0,
     ) -> None:
         super().__init__(drivers, harm_count=harm_count, allowance=allowance)
@@ -86,7 +87,7 @@ class RobustShield(StepShield):
             return plans
         actions = np.repeat(CONSTANT_ACTIONS[:, np.newaxis], len(learners), axis=1)
         commands = actions * states.braking_capacity_mps2[:, np.newaxis, learners - 1]
-        harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], self.count)[0]
+        harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], self.harm_count)[0]
         best = harm.reshape(n, states.n // n, -1).max(axis=1).argmin(axis=1)
         return [*plans, constant_plans(game, actions[best])]
 

@@ -21,7 +21,7 @@ import numpy as np
 from ethbrake_marl.agent_names import open_game, teams_of
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import Team
-from ethbrake_marl.episode.counts import COLUMN
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, amounts, objectives_of
 from ethbrake_marl.episode.state import FIRST_DECISION, State
@@ -186,7 +186,7 @@ def measure_level(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None
     )
 
 
-def minimised_amount(declared: Declared, count: str, game: Game, alert: State, last: State) -> MeasureValue:
+def minimised_amount(declared: Declared, count: HarmCount, game: Game, alert: State, last: State) -> MeasureValue:
     """What the training minimises: the objective ``declared`` in ``count``, mean over the learners, [n]; a measure if
     bound.
     """
@@ -220,16 +220,22 @@ def with_optima(plan: Ablation, measured: Sequence[LevelResult], threads: int, t
                 say = partial(_tell_progress, tell, f"joint optimum of {name}")
                 folder = plan.folder / "optimum" / name
                 tables[identity] = search_list(
-                    game, worlds, chunks=folder, on_progress=say, counts=[*COLUMN], budget=plan.budget, threads=threads
+                    game,
+                    worlds,
+                    chunks=folder,
+                    on_progress=say,
+                    harm_counts=BUILT_IN_COUNTS,
+                    budget=plan.budget,
+                    threads=threads,
                 )
             teams = [result.reached for result in measured if result.level.name == name]
             team_harm = {
-                count: [row[: worlds.n] for columns in teams for row in columns[column]]
-                for count, column in COLUMN.items()
+                count.name: [row[: worlds.n] for columns in teams for row in columns[count.column]]
+                for count in BUILT_IN_COUNTS
             }
             answers[name] = Answer(scenario, game, worlds, tables[identity], team_harm)
     best = {
-        name: {count: least_known(answer, answers.values(), count)[np.newaxis] for count in COLUMN}
+        name: {count.name: least_known(answer, answers.values(), count)[np.newaxis] for count in BUILT_IN_COUNTS}
         for name, answer in answers.items()
     }
     return [result._replace(best=best.get(result.level.name)) for result in measured]
@@ -239,7 +245,7 @@ def _tell_progress(tell: OnProgress, name: str, finished: int, total: int) -> No
     tell(Progress(name, finished, total))
 
 
-def least_known(answer: Answer, answers: Iterable[Answer], count: str) -> Floats:
+def least_known(answer: Answer, answers: Iterable[Answer], count: HarmCount) -> Floats:
     """Least known harm in each world, [m] m2/s2, among the commands of all ``answers`` that ``can_imitate`` allows."""
     best = np.full(answer.worlds.n, np.inf)
     for original in answers:
@@ -253,7 +259,7 @@ def least_known(answer: Answer, answers: Iterable[Answer], count: str) -> Floats
                 harm = problem.follow(profiles.take(rows)).harm(count)
                 best[rows] = np.minimum(best[rows], harm)
             same = rows[original.worlds.line[rows, GAP, 0] == answer.worlds.line[rows, GAP, 0]]
-            for harm in original.team_harm[count]:
+            for harm in original.team_harm[count.name]:
                 best[same] = np.minimum(best[same], harm[same])
     return best
 

@@ -77,7 +77,7 @@ def ablate_command(
     The command trains policies at all levels, compares the levels by both harms and the honest cost, and writes
     ablation.json, ablation.csv and the figure ablation.png. After an interruption, repeat the command to continue.
 
-    The policies minimise what the recipe counts; with --set rules=paper first-impact harm.
+    The policies minimise what the recipe counts; with --set harm_count=first first-impact harm.
 
     With --sweep, the levels are copies of one scenario in which one key has different values.
     """
@@ -100,7 +100,7 @@ def ablate_command(
             raise InvalidInput("--sweep is given twice; give it once, because the figures can show only one swept key")
         loaded = [load_recipe(name.strip()) for name in recipes.split(",")]
         changes = read_settings(settings, [key for recipe in loaded for key in type(recipe).model_fields])
-        changed_recipes = [change_recipe(recipe, changes.recipe, out) for recipe in loaded]
+        changed_recipes = [change_recipe(recipe, changes.recipe) for recipe in loaded]
         changed_recipes = [recipe if recipe.scheme else recipe.replace(scheme="shared") for recipe in changed_recipes]
         usual = ",".join(STANDARD) if sweep is None else SWEEP_LEVEL
         names = [name.strip() for name in (levels or usual).split(",")]
@@ -172,16 +172,16 @@ def front_command(
     """Show how sparing one vehicle changes the harm of the others.
 
     For each choice of weights, a search looks in every world for the commands with the least weighted honest cost (with
-    --set rules=paper: first-impact harm). Beside them stand full braking, maximin (the least that the largest cost of a
-    vehicle can be) and agents, each of which drives all learners. The default weights are a grid, equal weights, and,
-    for each vehicle, 1 with a tiny weight for all others. The command writes front.json and front.png.
+    --set harm_count=first: first-impact harm). Beside them stand full braking, maximin (the least that the largest cost
+    of a vehicle can be) and agents, each of which drives all learners. The default weights are a grid, equal weights,
+    and, for each vehicle, 1 with a tiny weight for all others. The command writes front.json and front.png.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
 
         from ethbrake_marl.agent_names import split_specs
         from ethbrake_marl.cli.settings import read_settings
-        from ethbrake_marl.episode.counts import check_count
+        from ethbrake_marl.episode.counts import HONEST, HarmCount
         from ethbrake_marl.extensions.cooperation.front import (
             FRONT_CHUNK,
             corners,
@@ -203,8 +203,7 @@ def front_command(
         from ethbrake_marl.worlds.sampling import merge_draws
 
         changes = read_settings(settings, of_command=("harm_count",))
-        chosen, count = changes.change_scenario(scenario), changes.command.get("harm_count", "honest")
-        check_count("harm_count", count)
+        chosen, count = changes.change_scenario(scenario), changes.command.get("harm_count", HONEST)
         rows: Any
         if weights is None:
             N = chosen.vehicles
@@ -227,7 +226,7 @@ def front_command(
 
         with stop_on_signal() as stop:
             front = search_front(
-                chosen, drawn_worlds.worlds, rows, count=count, budget=budget, threads=jobs or 1,
+                chosen, drawn_worlds.worlds, rows, harm_count=HarmCount.of(count), budget=budget, threads=jobs or 1,
                 agents=compared_agents, on_progress=tell, stop=stop,
             )  # fmt: skip
         n = front.amounts.shape[1]

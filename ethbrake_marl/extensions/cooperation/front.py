@@ -15,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.agent_names import make_teams, open_game
 from ethbrake_marl.agents.team import Team
-from ethbrake_marl.episode.counts import COUNTS, check_count
+from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount, all_counts
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -34,7 +34,7 @@ MOST_CHOICES = 1_000  # choices of weights in a grid
 SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides between equal choices
 FIRST_SHARE = 0.6  # of the budget; the second round starts from the best results of all choices of weights
 
-BorneHarm = Mapping[str, Floats]  # count of harm -> harm that each vehicle bears
+BorneHarm = Mapping[str, Floats]  # name of a count of harm -> harm that each vehicle bears
 OnSearch = Callable[[int, int], None]  # called with the number of finished searches and of all
 
 
@@ -42,14 +42,14 @@ class Front(NamedTuple):
     """The harm of each vehicle in n worlds, under the best commands for each of W choices of weights."""
 
     weights: Floats  # [W, N] weights of the vehicles' harm
-    harm_count: str  # count that is weighted (``episode.counts``)
+    harm_count: HarmCount  # which is weighted
     borne: BorneHarm  # [W, n, N] m2/s2 by count
     agents: Mapping[str, BorneHarm]  # agent -> harm of each vehicle if it drives, [W, n, N] m2/s2 by count
 
     @property
     def amounts(self) -> Floats:
         return np.stack(
-            [weighted_harm(harm, row) for harm, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
+            [weighted_harm(harm, row) for harm, row in zip(self.borne[self.harm_count.name], self.weights, strict=True)]
         )
 
 
@@ -113,7 +113,7 @@ def search_front(
     worlds: State,
     weights: Sequence[Sequence[float]] | Floats,
     *,
-    count: str = "honest",
+    harm_count: AnyCount = HONEST,
     budget: int = FRONT_BUDGET,
     threads: int = 1,
     agents: Sequence[str] = (),
@@ -137,7 +137,7 @@ def search_front(
         scenario: its learners are controlled.
         worlds: n worlds at the alert.
         weights: weights of the vehicles' harm, [W, N].
-        count: count of harm that is weighted: ``first``, ``total`` or ``honest``.
+        harm_count: count of harm that is weighted (``episode.counts``).
         budget: number of profiles (commands over time) that are tried for each world and choice of weights.
         threads: number of threads.
         agents: names of agents to compare. Each drives all learners, with each choice of weights as the scenario's
@@ -150,7 +150,7 @@ def search_front(
     ``harm_weight``.
 
     """
-    check_count("count", count)
+    count = HarmCount.of(harm_count)
     weights = weight_table(weights.tolist() if isinstance(weights, np.ndarray) else weights)
     if weights.shape[1] != scenario.vehicles:
         raise InvalidInput(
@@ -183,7 +183,7 @@ def search_front(
 
 
 def _join_chunks(parts: Sequence[BorneHarm]) -> BorneHarm:
-    return {count: np.concatenate([part[count] for part in parts], axis=1) for count in COUNTS}
+    return {count: np.concatenate([part[count] for part in parts], axis=1) for count in parts[0]}
 
 
 class Drivers(NamedTuple):
@@ -192,7 +192,7 @@ class Drivers(NamedTuple):
     alone: Mapping[int, Drivers]  # body -> the same for each of several learners, while the others brake fully
 
     @staticmethod
-    def of(scenario: Scenario, weights: Floats, names: Sequence[str], count: str) -> Drivers:
+    def of(scenario: Scenario, weights: Floats, names: Sequence[str], count: HarmCount) -> Drivers:
         """The learners, and for each choice of weights (row of ``weights`` [W, N]) the agents that minimise the
         weighted harm.
 
@@ -210,14 +210,19 @@ class Drivers(NamedTuple):
 
 
 def _search_chunk(
-    drivers: Drivers, worlds: State, weights: Floats, count: str, effort: Mapping[str, int], tell: Callable[[int], None]
+    drivers: Drivers,
+    worlds: State,
+    weights: Floats,
+    count: HarmCount,
+    effort: Mapping[str, int],
+    tell: Callable[[int], None],
 ) -> tuple[ProfilePool, dict[str, BorneHarm]]:
     """Pool of the best profiles (commands over time) of all searches, and the harm of each vehicle if agents drive.
 
     Each of several learners is first searched alone. Then every choice of weights is searched twice; the second search
     starts from the best profiles of all choices.
     """
-    pool = ProfilePool(problem_of(drivers.game, worlds, count=count), count)
+    pool = ProfilePool(problem_of(drivers.game, worlds, harm_count=count), count)
     driven, problem = _try_known_commands(pool, worlds, weights, drivers.preferring), pool.problem
     starts: list[list[Profiles]] = [[*starting_profiles(problem, worlds)] for _ in weights]
     for body, single in drivers.alone.items():
@@ -246,7 +251,7 @@ def _try_known_commands(
     constants = problem.constant(problem.even_grid(FRONT_CONSTANTS))
     for q in range(FRONT_CONSTANTS):
         pool.add(constants.take(slice(q, None, FRONT_CONSTANTS)))
-    pool.add(best_stored(problem, pool.count)[1])
+    pool.add(best_stored(problem, pool.harm_count)[1])
     driven: dict[str, list[BorneHarm]] = {name: [] for name in preferring[0][1]}
     for row, (game, teams) in zip(weights, preferring, strict=True):
         car = worlds.car.copy()
@@ -258,7 +263,7 @@ def _try_known_commands(
                 profiles = driven_profiles(problem, game, worlds._replace(car=car), team)
                 driven[name].append(pool.add(profiles))
     return {
-        name: {count: np.stack([borne[count] for borne in results]) for count in COUNTS}
+        name: {count: np.stack([borne[count] for borne in results]) for count in pool.borne}
         for name, results in driven.items()
     }
 
@@ -275,23 +280,24 @@ def observes_weights(team: Team) -> bool:
 class ProfilePool:
     """Profiles (commands over time) that have been tried in n worlds, with the harm of each vehicle."""
 
-    def __init__(self, problem: Problem, count: str) -> None:
-        self.problem, self.count = problem, count
+    def __init__(self, problem: Problem, count: HarmCount) -> None:
+        self.problem, self.harm_count = problem, count
         self.profiles: list[Profiles] = []
-        self.borne: dict[str, list[Floats]] = {harm_count: [] for harm_count in COUNTS}
+        self.counts = all_counts(count)
+        self.borne: dict[str, list[Floats]] = {each.name: [] for each in self.counts}
 
     def add(self, profiles: Profiles) -> BorneHarm:
         self.profiles.append(profiles)
         last = self.problem.follow(profiles)
-        for count, harms in self.borne.items():
-            harms.append(last.borne_harm(count))
+        for count in self.counts:
+            self.borne[count.name].append(last.borne_harm(count))
         return {count: harms[-1] for count, harms in self.borne.items()}
 
     def choice(self, weights: Floats) -> Ints:
         """Number of the profile with the least weighted harm in each world, [n]; among equals, with the least total
         harm.
         """
-        borne = np.stack(self.borne[self.count])
+        borne = np.stack(self.borne[self.harm_count.name])
         amounts = weighted_harm(borne, weights)
         least = amounts.min(axis=0)
         return np.asarray(np.where(amounts == least, borne.sum(axis=2), np.inf).argmin(axis=0))
@@ -320,9 +326,11 @@ def least_largest(
     game, parts = open_game(scenario)[1], []
     for first in range(0, worlds.n, FRONT_CHUNK):
         some = worlds.take(slice(first, first + FRONT_CHUNK))
-        table = best_harm(game, some, counts=(front.harm_count,), budget=budget, threads=threads, objective="maximin")
-        last = problem_of(game, some).follow(table.profiles[front.harm_count])
-        parts.append({count: last.borne_harm(count)[np.newaxis] for count in COUNTS})
-    every = {count: np.concatenate([_join_chunks(parts)[count], front.borne[count]]) for count in COUNTS}
-    chosen = every[front.harm_count].max(axis=2).argmin(axis=0)
+        table = best_harm(
+            game, some, harm_counts=(front.harm_count,), budget=budget, threads=threads, objective="maximin"
+        )
+        last = problem_of(game, some).follow(table.profiles[front.harm_count.name])
+        parts.append({count.name: last.borne_harm(count)[np.newaxis] for count in all_counts(front.harm_count)})
+    every = {count: np.concatenate([_join_chunks(parts)[count], front.borne[count]]) for count in front.borne}
+    chosen = every[front.harm_count.name].max(axis=2).argmin(axis=0)
     return {count: borne[chosen, np.arange(worlds.n)] for count, borne in every.items()}

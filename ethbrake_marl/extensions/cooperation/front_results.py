@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter
 from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.agents.team import Team, play_to_end
-from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.provenance import about_scenario, versions, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Clusters, difference, mean
@@ -20,7 +20,7 @@ from ethbrake_marl.evaluation.summary import by_recording
 from ethbrake_marl.extensions.cooperation.front import BorneHarm, Front, weighted_harm
 from ethbrake_marl.extensions.cooperation.results import Json
 from ethbrake_marl.extensions.report.style import (
-    TITLES,
+    axis_title,
     finish,
     in_our_style,
     label_text,
@@ -57,12 +57,12 @@ def front_results(
         "seed": seed,
         "episodes": drawn_worlds.worlds.n,
         **({} if by is None else {"recordings": len(np.unique(by))}),
-        "harm_count": front.harm_count,
+        "harm_count": front.harm_count.name,
         "vehicles": list(scenario.vehicle_names),
         "beside": {name: _vehicles(borne, by) for name, borne in beside.items()},
         "points": _points(front, front.borne, by),
         "agents": {name: _points(front, borne, by) for name, borne in front.agents.items()},
-        "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count]),
+        "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count.name]),
         "scenario_sha256": about_scenario(scenario)["scenario_sha256"],
         "worlds_sha256": worlds_sha256(drawn_worlds.worlds),
         "versions": versions(),
@@ -72,11 +72,11 @@ def front_results(
 def _points(front: Front, borne: BorneHarm, by: Clusters) -> list[Json]:
     points = []
     for k, (weights, least) in enumerate(zip(front.weights, front.amounts, strict=True)):
-        harm = borne[front.harm_count][k]
+        harm = borne[front.harm_count.name][k]
         amounts = weighted_harm(harm, weights)
         points.append({
             "weights": weights.tolist(),
-            "vehicles": _vehicles({count: borne[count][k] for count in COUNTS}, by),
+            "vehicles": _vehicles({count: each[k] for count, each in borne.items()}, by),
             "amount": mean(amounts, by).to_json(),
             "sum": mean(harm.sum(axis=1), by).to_json(),
             "above": difference(amounts, least, by).to_json(),
@@ -86,7 +86,7 @@ def _points(front: Front, borne: BorneHarm, by: Clusters) -> list[Json]:
 
 
 def _vehicles(borne: BorneHarm, by: Clusters) -> dict[str, list[Json]]:
-    return {count: [mean(harm, by).to_json() for harm in borne[count].T] for count in COUNTS}
+    return {count: [mean(harm, by).to_json() for harm in each.T] for count, each in borne.items()}
 
 
 def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
@@ -99,7 +99,8 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
     if len(full_brake.T) > MOST_DIMENSIONS:
         return []
     points = {
-        name: borne[front.harm_count].mean(axis=1) for name, borne in {FRONT_NAME: front.borne, **front.agents}.items()
+        name: borne[front.harm_count.name].mean(axis=1)
+        for name, borne in {FRONT_NAME: front.borne, **front.agents}.items()
     }
     braking = full_brake.mean(axis=0)
     references = {
@@ -142,16 +143,17 @@ def hypervolume(points: Floats, reference: Floats) -> float:
 def full_braking(scenario: Scenario, drawn_worlds: DrawnWorlds) -> BorneHarm:
     game = open_game(scenario)[1]
     last = play_to_end(game, drawn_worlds.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
-    return {count: last.borne_harm(count) for count in COUNTS}
+    return {count.name: last.borne_harm(count) for count in last.counts}
 
 
 def front_sheet(results: Json) -> Sheet:
     """Table with one row for each choice of weights, then one for each result that is compared with the front."""
-    count, agents = results["harm_count"], results["agents"]
+    count, agents = HarmCount.of(results["harm_count"]), results["agents"]
+    counts = [HarmCount.of(name) for name in results["points"][0]["vehicles"]]
 
     def row(name: str, vehicles: Mapping[str, list[Json]], *ratios: float | None) -> tuple[str | float | None, ...]:
-        means = {harm_count: [harm["value"] for harm in vehicles[harm_count]] for harm_count in COUNTS}
-        return (name, *means[count], *map(sum, means.values()), *ratios)
+        means = {each.name: [harm["value"] for harm in vehicles[each.name]] for each in counts}
+        return (name, *means[count.name], *map(sum, means.values()), *ratios)
 
     rows = [
         row(",".join(f"{weight:g}" for weight in point["weights"]), point["vehicles"], *ratios)
@@ -164,13 +166,12 @@ def front_sheet(results: Json) -> Sheet:
     rows += [row(name, vehicles) for name, vehicles in results["beside"].items()]
     columns = [
         Column("Weights"), *(Column(f"Vehicle {k + 1}", short=f"V{k + 1}") for k in range(len(results["vehicles"]))),
-        Column("Sum, first impacts", short="First"), Column("Sum, all impacts", short="All"),
-        Column("Sum, honest cost", short="Honest"),
+        *(Column(f"Sum, {each.words}", short=each.name.capitalize()) for each in counts),
         *(Column(name, digits=3, short=re.sub("(?<=[/+])", "\n", name)) for name in agents),
     ]  # fmt: skip
     note = (
-        f"Mean {IN_WORDS[count]} of each vehicle, and mean first-impact harm, total harm and honest cost of the line,"
-        f" m2/s2. Agents: weighted {IN_WORDS[count]} of the agent divided by that of the front"
+        f"Mean {count.words} of each vehicle, and mean {', '.join(each.words for each in counts)} of the line, m2/s2."
+        f" Agents: weighted {count.words} of the agent divided by that of the front"
         f"{by_recording(results.get('recordings', 0))}."
     )
     return Sheet(f"Front of {results['scenario']}, {results['episodes']:,} worlds", columns, rows, note, gap=2)
@@ -184,17 +185,19 @@ def hypervolume_sheet(results: Json) -> Sheet:
         for name, volume in entry["of"].items()
     ]
     columns: list[Column | str] = ["Reference", "Of", Column("Hypervolume"), share]
-    return Sheet(f"Hypervolume of the mean {IN_WORDS[results['harm_count']]}, (m2/s2)^N", columns, rows, gap=2)
+    return Sheet(
+        f"Hypervolume of the mean {HarmCount.of(results['harm_count']).words}, (m2/s2)^N", columns, rows, gap=2
+    )
 
 
 @in_our_style
 def front_figure(results: Json) -> Figure:
     """Draw one point for each choice of weights: mean harm of the line, and of the vehicle that bears most."""
     beside = {name: [{"vehicles": vehicles}] for name, vehicles in results["beside"].items()}
-    count, all_positive = results["harm_count"], True
+    count, all_positive = HarmCount.of(results["harm_count"]), True
     figure, (axes,) = new_panels(SIZE_IN)
     for number, (name, points) in enumerate({"Pareto front": results["points"], **beside, **results["agents"]}.items()):
-        harm = np.array([[vehicle["value"] for vehicle in point["vehicles"][count]] for point in points])
+        harm = np.array([[vehicle["value"] for vehicle in point["vehicles"][count.name]] for point in points])
         style = series_style(number) | {"linestyle": "none", "markersize": 5.0, "fillstyle": "none"}
         axes.plot(harm.sum(axis=1), harm.max(axis=1), label=label_text(name, 34), **style)
         all_positive &= bool((harm.max(axis=1) > 0.0).all())
@@ -204,7 +207,9 @@ def front_figure(results: Json) -> Figure:
             axis.set_major_formatter(FuncFormatter(plain_number))
             axis.set_minor_formatter(FuncFormatter(plain_number))
     axes.tick_params(which="minor", labelsize=7)
-    axes.set(xlabel=f"Line: {TITLES[count].lower()}", ylabel=f"Vehicle that bears most: {TITLES[count].lower()}")
+    axes.set(
+        xlabel=f"Line: {axis_title(count).lower()}", ylabel=f"Vehicle that bears most: {axis_title(count).lower()}"
+    )
     worlds = count_of(results["episodes"], "world")
     caption = f"{results['scenario']}, {worlds}; one point for each of {len(results['points'])} choices of the weights."
     return finish(figure, caption, axes, columns=2, fontsize=8)

@@ -13,14 +13,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ethbrake_marl.episode.counts import COLUMN, IN_WORDS
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, HarmCount
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.evaluate import SEED
 from ethbrake_marl.extensions.cooperation.ablation import CSV, FIGURE, FULL, JSON, Ablation, LevelResult
 from ethbrake_marl.extensions.cooperation.seeds import mean_over_seeds, share_over_seeds
 from ethbrake_marl.extensions.report.style import (
     GREY,
-    TITLES,
+    axis_title,
     finish,
     in_our_style,
     new_panels,
@@ -92,9 +92,10 @@ def _level(result: LevelResult, searched: int) -> Json:
         "worlds": result.reached["collided"].shape[1],
         "collision_rate": mean(result.reached["collided"]).to_json(),
     }
-    for count, column in COLUMN.items():
+    for count in BUILT_IN_COUNTS:
+        column = count.column
         reached, braking = result.reached[column], result.braking[column]
-        entry[count] = {
+        entry[count.name] = {
             "full_brake": mean(braking).to_json(),
             "harm": mean(reached).to_json(),
             "each_seed": reached.mean(axis=1).tolist(),
@@ -104,10 +105,10 @@ def _level(result: LevelResult, searched: int) -> Json:
     return entry
 
 
-def _beside_optimum(result: LevelResult, count: str, searched: int) -> Json:
+def _beside_optimum(result: LevelResult, count: HarmCount, searched: int) -> Json:
     first = None if result.clusters is None else result.clusters[:searched]
-    reached, braking = result.reached[COLUMN[count]][:, :searched], result.braking[COLUMN[count]][:, :searched]
-    best = None if result.best is None else result.best[count]
+    reached, braking = result.reached[count.column][:, :searched], result.braking[count.column][:, :searched]
+    best = None if result.best is None else result.best[count.name]
     mean = partial(mean_over_seeds, clusters=first)
     share = None if best is None else share_over_seeds(reached, braking, best, first)
     return {
@@ -129,10 +130,11 @@ def _change(before: LevelResult, after: LevelResult, algorithm: str) -> Json:
     for word, result in (("from", before), ("to", after)):
         entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in level_key(result).items()}
     mean = partial(mean_over_seeds, clusters=after.clusters)
-    for count, column in COLUMN.items():
+    for count in BUILT_IN_COUNTS:
+        column = count.column
         new, old = (np.stack(_borne_columns(measured, column), axis=2) for measured in (after, before))
         worse = new > old + HARM_TOLERANCE
-        entry[count] = {
+        entry[count.name] = {
             "difference": mean(after.reached[column], before.reached[column]).to_json(),
             "vehicles": [mean(new[:, :, i], old[:, :, i]).to_json() for i in range(new.shape[2])],
             "worse_off": mean(worse.any(axis=2)).to_json(),
@@ -174,7 +176,7 @@ def write_ablation(plan: Ablation, measured: Sequence[LevelResult], results: Jso
 def conditions(plan: Ablation, number: int) -> str:
     """Sentences that say how the results over ``number`` worlds were made."""
     recipes = ", ".join(
-        f"{name} (rewarded for {IN_WORDS[recipe.reward.harm_count]})"
+        f"{name} (rewarded for {recipe.reward.harm_count.words})"
         for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
     )
     alike = plan.levels[0].same_vehicles
@@ -199,12 +201,13 @@ def levels_csv(measured: Sequence[LevelResult], searched: int) -> str:
         for seed in range(len(result.reached["collided"])):
             row: Json = {**level_key(result), "algorithm": result.algorithm, "seed": seed if result.algorithm else None}
             row |= {name: float(values[seed].mean()) for name, values in result.reached.items()}
-            for count, name in COLUMN.items():
+            for count in BUILT_IN_COUNTS:
+                name, best = count.column, None if result.best is None else result.best[count.name]
                 row |= {
                     f"full_brake_{name}": float(result.braking[name].mean()),
                     f"searched_{name}": float(result.reached[name][seed, :searched].mean()),
                     f"searched_full_brake_{name}": float(result.braking[name][:, :searched].mean()),
-                    f"searched_best_known_{name}": None if result.best is None else float(result.best[count].mean()),
+                    f"searched_best_known_{name}": None if best is None else float(best.mean()),
                 }
             rows.append(row)
     return csv_text(rows)
@@ -224,7 +227,7 @@ def tables(results: Json) -> list[Sheet]:
     worlds = count_of(levels[0]["first"]["searched"]["worlds"], "world")
     searched_levels = [level for level in levels if level["first"]["searched"]["best_known"] is not None]
     sheets = []
-    for count, harm in ((count, IN_WORDS[count]) for count in COLUMN):
+    for count, harm in ((count.name, count.words) for count in BUILT_IN_COUNTS):
         sheets += [
             sheet(f"Levels, {harm}", levels, [
                 *about, *algorithm, (share("Collisions"), "collision_rate"),
@@ -274,13 +277,14 @@ def ablation_figure(results: Json, caption: str) -> Figure:
     at = {level["level"]: level.get("swept_number", names.index(level["level"])) for level in levels}
     unit = (max(at.values()) - min(at.values())) / (len(at) - 1)  # mean distance between neighbours
     width = min(max(LEVEL_IN * len(at), NARROWEST_IN), WIDEST_IN)
-    counts = [count for count in COLUMN if count in {recipe["reward"]["harm_count"] for recipe in recipes.values()}]
+    rewarded = {recipe["reward"]["harm_count"] for recipe in recipes.values()}
+    counts = [count for count in BUILT_IN_COUNTS if count.name in rewarded]
     figure, panels = new_panels((width, PANEL_IN * len(counts)), rows=len(counts))
     bar = 0.7 * unit / len(recipes)
     for axes, count in zip(panels, counts, strict=True):
         for number, algorithm in enumerate(recipes):
             shown = [level for level in levels if level["algorithm"] in (None, algorithm)]
-            harms = [Estimate(**level[count]["searched"]["harm"]) for level in shown]
+            harms = [Estimate(**level[count.name]["searched"]["harm"]) for level in shown]
             ends = list(zip(*((h.value - h.ends[0], h.ends[1] - h.value) for h in harms), strict=True))
             places = [at[level["level"]] + bar * (number - (len(recipes) - 1) / 2) for level in shown]
             colour = series_style(1 if number == 0 else number + 3)["color"]
@@ -288,13 +292,13 @@ def ablation_figure(results: Json, caption: str) -> Figure:
             for place, harm in zip(places, harms, strict=True):
                 mean, at_top = f"{harm.value:.2f}", axes.get_xaxis_transform()
                 axes.text(place, 0.94, mean, transform=at_top, ha="center", fontsize=8)
-        _draw_bounds(axes, [(at[level["level"]], level[count]["searched"]) for level in levels], 0.42 * unit)
+        _draw_bounds(axes, [(at[level["level"]], level[count.name]["searched"]) for level in levels], 0.42 * unit)
         if results["settings"]["swept"] is None:
             words = [name.removeprefix("cooperation-").removeprefix("level-").replace("-", "\n", 1) for name in names]
             axes.set_xticks([at[name] for name in names], words, fontsize=8)
-        braking = [level[count]["searched"]["full_brake"]["value"] for level in levels]
+        braking = [level[count.name]["searched"]["full_brake"]["value"] for level in levels]
         axes.set_ylim(0.0, min(1.1 * axes.get_ylim()[1], MOST_SHOWN * float(np.median(braking))))
-        axes.set(title=TITLES[count], xlabel=results["settings"]["swept"] or "")
+        axes.set(title=axis_title(count), xlabel=results["settings"]["swept"] or "")
     return finish(figure, " ".join([*results["undertrained"], caption]), panels[0], columns=3, fontsize=8.5)
 
 

@@ -37,7 +37,7 @@ def to_parquet(
     scenario: AnyScenario,
     episodes: int,
     seed: int = SEED,
-    reward: Any = "harm",
+    reward: Any = "honest",
     force: bool = False,
 ) -> None:
     """Let each of ``agents`` drive all learners in the worlds 0 to ``episodes`` - 1; write a row per agent, world,

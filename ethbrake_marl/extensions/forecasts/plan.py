@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.episode.commands import command_of, commands_of
-from ethbrake_marl.episode.counts import amount_so_far, weights_of
+from ethbrake_marl.episode.counts import HONEST, amount_so_far
 from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
@@ -144,7 +144,7 @@ def _plans(state: State, observers: Ints, time_step_s: float) -> Floats:
     trials, costs = np.zeros((TRIALS, PER_COMMAND)), np.zeros(TRIALS)
     memory = scratch_for(bodies), line, observer_line, parameters, np.zeros(bodies), trials, costs
     failed = plan_worlds(
-        state.line, state.car, state.clock, state.know, observers, time_step_s, weights_of("honest"), memory, out
+        state.line, state.car, state.clock, state.know, observers, time_step_s, HONEST.weights, memory, out
     )
     if failed >= 0:
         raise PhysicsError({failed: f"the forecast of a plan failed before the end of its {FORECAST_S:g} s"})

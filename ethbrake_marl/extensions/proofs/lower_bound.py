@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import check_count
+from ethbrake_marl.episode.counts import ALL_IMPACTS, BUILT_IN_COUNTS, HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import hold_commands
 from ethbrake_marl.errors import InvalidInput
@@ -235,7 +235,12 @@ def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, boxes, me
 
 
 def lower_bound(
-    state: State, body: int = 2, *, count: str = "first", horizon_s: float = 8.0, time_step_s: float | None = None
+    state: State,
+    body: int = 2,
+    *,
+    harm_count: AnyCount = HONEST,
+    horizon_s: float = 8.0,
+    time_step_s: float | None = None,
 ) -> LowerBound:
     """Proven lower bound on the harm of every episode, over all commands of the vehicle ``body`` from now on.
 
@@ -247,26 +252,27 @@ def lower_bound(
     Args:
         state: the n episodes now.
         body: the controlled vehicle (1: Vehicle 1); all others brake fully.
-        count: ``first`` (of each pair only the first impact), ``total``, or ``honest``. The honest cost is never below
-            total harm; with a time step, ``combined`` also counts the prices of pushing and driving and further
+        harm_count: ``first`` (of each pair only the first impact), ``total``, or ``honest``. The honest cost is never
+            below total harm; with a time step, ``combined`` also counts the prices of pushing and driving and further
             impacts (``chain_search``), which takes 0.02 s a world.
         horizon_s: time until which harm counts, s after the alert.
         time_step_s: time between two decisions (s); the first decision is when the vehicle may act. None: commands
             may change at any time. With a time step the bound is larger, but holds only for commands that change at
             decisions, and takes ten times as long.
 
-    Raises ``InvalidInput`` where ``avoidability`` does, for an obstacle, an unknown count, a time step below
+    Raises ``InvalidInput`` where ``avoidability`` does, for an obstacle, another count, a time step below
     ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
 
     """
     reason = avoidability(state, body).reason
     start = state.time_s + rows_of(state, body)[:, ONSET_F]
+    count = HarmCount.of(harm_count, "lower_bound: harm_count")
     _check_asked(state, start, count, horizon_s, time_step_s)
-    columns = BOXES if count == "honest" and time_step_s is not None else 0
-    count = "total" if count == "honest" else count
+    columns = BOXES if count == HONEST and time_step_s is not None else 0
+    count = ALL_IMPACTS if count == HONEST else count
     full = np.pad(-state.braking_capacity_mps2, ((0, 0), (1, 0)))
     now = hold_commands(state._replace(wanted=full), start)  # until then all brake fully
-    counts = (now.speeds_mps[:, 1:] >= 0.0) & (now.speeds_mps[:, :-1] >= 0.0) & ((count == "total") | ~now.pair_hit)
+    counts = (now.speeds_mps[:, 1:] >= 0.0) & (now.speeds_mps[:, :-1] >= 0.0) & ((count == ALL_IMPACTS) | ~now.pair_hit)
     none = np.zeros(state.n, np.bool_)
     has_front = counts[:, body - 2] if body > 1 else none
     has_rear = counts[:, body - 1] if body < state.vehicles else none
@@ -287,8 +293,10 @@ def lower_bound(
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined)
 
 
-def _check_asked(state: State, start: Floats, count: str, horizon_s: float, time_step_s: float | None) -> None:
-    check_count("lower_bound: count", count)
+def _check_asked(state: State, start: Floats, count: HarmCount, horizon_s: float, time_step_s: float | None) -> None:
+    if count not in BUILT_IN_COUNTS:
+        known = ", ".join(known.name for known in BUILT_IN_COUNTS)
+        raise InvalidInput(f"lower_bound: harm_count = {count.name!r}: a bound is proven only for {known}")
     if not (isinstance(horizon_s, int | float) and (start <= horizon_s).all() and horizon_s < math.inf):
         raise InvalidInput(
             f"lower_bound: horizon_s = {horizon_s!r}: must be a finite number of at least {start.max():g} (s): by then"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -28,7 +29,7 @@ def avoidable(game: Game, alert: State, last: State) -> MeasureValue:
     return {"": verdict.avoidable, "reason": verdict.reason_name}
 
 
-_bound_cache: dict[str, tuple[bytes, LowerBound]] = {}  # count -> worlds of the last request, and their bounds
+_bound_cache: dict[HarmCount, tuple[bytes, LowerBound]] = {}  # count -> worlds of the last request, and their bounds
 
 
 def proven_harm(game: Game, alert: State, last: State) -> MeasureValue:
@@ -36,7 +37,7 @@ def proven_harm(game: Game, alert: State, last: State) -> MeasureValue:
 
     ``impact``: whether the bound is above 0. The result is the same for every agent.
     """
-    bound = _bound(game, alert, "first")
+    bound = _bound(game, alert, FIRST_IMPACTS)
     return {"": bound.harm, "impact": bound.impact_proven}
 
 
@@ -45,16 +46,18 @@ def proven_cost(game: Game, alert: State, last: State) -> MeasureValue:
 
     The result is the same for every agent.
     """
-    return {"": _bound(game, alert, "honest").harm}
+    return {"": _bound(game, alert, HONEST).harm}
 
 
-def _bound(game: Game, alert: State, count: str) -> LowerBound:
+def _bound(game: Game, alert: State, count: HarmCount) -> LowerBound:
     body, settings = _controlled_body(game, alert), game.settings
     ends = np.array([body, settings.horizon_s, settings.time_step_s])
     departures = " ".join(sorted(alert.departures)).encode()  # a stored bound must not pass worlds that are refused
     request = departures + ends.tobytes() + alert.line.tobytes() + alert.car.tobytes()
     if request != _bound_cache.get(count, (b"",))[0]:
-        bound = lower_bound(alert, body, count=count, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s)
+        bound = lower_bound(
+            alert, body, harm_count=count, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s
+        )
         _bound_cache[count] = request, bound
     return _bound_cache[count][1]
 

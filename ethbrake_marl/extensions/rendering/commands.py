@@ -56,7 +56,7 @@ def watch_command(
         chosen = read_settings(settings, of_command=("harm_count",))
         loaded, game = open_game(chosen.change_scenario(scenario))
         require_learner(loaded)
-        teams = teams_of(agents, loaded, harm_count=chosen.command.get("harm_count", "first"))
+        teams = teams_of(agents, loaded, **chosen.command)
         titled = {f"{name}: world {world} of {loaded.name}": team for name, team in teams.items()}
         films = films_of(loaded.sample(1, seed, first=world), titled, game)
         if in_words:

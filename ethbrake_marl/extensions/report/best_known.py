@@ -7,13 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import COLUMN, HARM
+from ethbrake_marl.episode.counts import IMPACT_COUNTS, HarmCount, all_counts
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.motion.layout import Bools, Floats
 
 REPORT_MEASURES = ("limits", "avoidable", "proven_harm")  # names for ``evaluate(measures=...)``
-BEST = {count: f"best_known_{count}" for count in COLUMN}  # count -> column; not all lists have the honest cost
 AVOIDABLE_COLUMN = "avoidable"  # whether contact is proven avoidable; where it is false, proven unavoidable
 UNAVOIDABLE = "proven_harm_impact"  # whether it is proven that no command avoids an impact
 
@@ -21,25 +20,25 @@ UNAVOIDABLE = "proven_harm_impact"  # whether it is proven that no command avoid
 class BestKnown(NamedTuple):
     """Least known harm in each of n worlds, and what is proven about contacts and impacts."""
 
-    harm: Mapping[str, Floats]  # count -> [n] m2/s2: both harms and, if it is known, the honest cost
+    harm: Mapping[HarmCount, Floats]  # count -> [n] m2/s2: both harms, and other counts that are known
     avoidable: Bools | None  # [n] whether contact can be avoided (proven); None: not measured
     unavoidable: Bools | None = None  # [n] whether no command avoids an impact (proven); None: not measured
 
     @classmethod
     def of(cls, result: Result) -> BestKnown | None:
         columns: Mapping[str, Any] = next(iter(result.columns.values()))
-        harm = {count: columns[name] for count, name in BEST.items() if name in columns}
+        names = {count: f"best_known_{count.name}" for count in all_counts()}
+        harm = {count: columns[name] for count, name in names.items() if name in columns}
         return (
-            cls(harm, columns.get(AVOIDABLE_COLUMN), columns.get(UNAVOIDABLE)) if HARM.keys() <= harm.keys() else None
+            cls(harm, columns.get(AVOIDABLE_COLUMN), columns.get(UNAVOIDABLE)) if {*IMPACT_COUNTS} <= {*harm} else None
         )
 
-    def regret(self, result: Result, agent: str, count: str) -> Floats:
-        return np.asarray(result[agent][COLUMN[count]] - self.harm[count])
+    def regret(self, result: Result, agent: str, count: HarmCount) -> Floats:
+        return np.asarray(result[agent][count.column] - self.harm[count])
 
 
-def shown_counts(compared: Comparison) -> dict[str, str]:
-    """First-impact harm, total harm, and what agents minimise unless its best is not known: count -> column."""
-    best_known, minimised = BestKnown.of(compared.result), compared.harm_count
-    return (
-        HARM if best_known is not None and minimised not in best_known.harm else {**HARM, minimised: COLUMN[minimised]}
-    )
+def shown_counts(compared: Comparison) -> list[HarmCount]:
+    """First-impact harm, total harm, and what agents minimise, as far as their best is known."""
+    best_known = BestKnown.of(compared.result)
+    counts = [*dict.fromkeys([*IMPACT_COUNTS, compared.harm_count])]
+    return counts if best_known is None else [count for count in counts if count in best_known.harm]

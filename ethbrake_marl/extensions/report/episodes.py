@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ethbrake_marl.agent_names import open_game
-from ethbrake_marl.episode.counts import COLUMN, HARM
+from ethbrake_marl.episode.counts import IMPACT_COUNTS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episodes
@@ -38,7 +38,7 @@ def player(
     """
     result, agents, worlds = compared.result, list(records), list[dict[str, Any]]()
     for (row, kind), *episodes in zip(kinds.items(), *records.values(), strict=True):
-        first, total = (result[focus][harm][row] for harm in HARM.values())
+        first, total = (result[focus][count.column][row] for count in IMPACT_COUNTS)
         worlds.append(
             {
                 "number": int(result.worlds["world"][row]),
@@ -136,7 +136,7 @@ TYPICAL = (0.5, 0.6, 0.7, 0.8, 0.9)  # quantiles of the harm
 
 def shown_worlds(compared: Comparison, focus: str) -> dict[int, str]:
     """Worlds in which to show the agent ``focus``: row of the result -> why it is shown."""
-    result, column = compared.result, COLUMN[compared.harm_count]
+    result, column = compared.result, compared.harm_count.column
     cost, best_known, chosen = result[focus][column], BestKnown.of(result), dict[int, str]()
 
     def add(kind: str, rows: Iterable[int] | Ints, most: int = WORLDS_PER_KIND) -> None:
@@ -163,7 +163,7 @@ def worst_rows(compared: Comparison, focus: str) -> Ints:
     """
     result, count, best_known = compared.result, compared.harm_count, BestKnown.of(compared.result)
     best = 0.0 if best_known is None else best_known.harm.get(count, 0.0)
-    value = result[focus][COLUMN[count]] - best
+    value = result[focus][count.column] - best
     return rows_by_value(value, value > 0.0)[:WORST_WORLDS]
 
 
@@ -189,8 +189,8 @@ def episodes_section(compared: Comparison, focus: str, kinds: dict[int, str]) ->
     n = compared.result.n
     body: list[str] = [f"{f'{len(rows)} of the {n:,}' if len(rows) < n else f'All {n}'} worlds, {until}."]
     for agent, episodes in records.items():
-        repeated_harm = np.array([[record.last.harm(count)[0] for count in HARM] for record in episodes])
-        evaluated_harm = np.column_stack([compared.result[agent][harm][rows] for harm in HARM.values()])
+        repeated_harm = np.array([[record.last.harm(count)[0] for count in IMPACT_COUNTS] for record in episodes])
+        evaluated_harm = np.column_stack([compared.result[agent][count.column][rows] for count in IMPACT_COUNTS])
         if changed_count := int((repeated_harm != evaluated_harm).any(axis=1).sum()):
             text = (
                 f"In {count_of(changed_count, 'world')} of these, {agent} drove differently the second time: the player"

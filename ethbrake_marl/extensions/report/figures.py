@@ -14,7 +14,7 @@ from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, PercentF
 from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import harm_of_deceleration, pairwise
-from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
+from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST, IMPACT_COUNTS, AnyCount, HarmCount
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput, count_of
@@ -29,7 +29,7 @@ from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.style import (
     DASHES,
     GREY,
-    TITLES,
+    axis_title,
     band,
     finish,
     in_our_style,
@@ -112,20 +112,20 @@ def harm_by_agent(compared: Comparison, tests: Mapping[str, Comparison]) -> Figu
     agents = list(result.columns)
     figure, (axes,) = new_panels((SLIM_IN, 0.9 + 0.24 * len(agents)))
     for k, agent in enumerate(agents):
-        harm = mean(result[agent][COLUMN[count]], result.clusters)
+        harm = mean(result[agent][count.column], result.clusters)
         axes.barh(k, harm.value, height=0.62, color=PALETTE[2])
         axes.hlines(k, *harm.ends, color=PALETTE[0], linewidth=1.6)
     if best_known is not None and count in best_known.harm:
         best = float(best_known.harm[count].mean())
         axes.axvline(best, color=PALETTE[3], linewidth=1.6, linestyle="--", label="best known")
     for number, (title, comparison) in enumerate(tests.items(), 4):
-        means = {agent: columns[COLUMN[count]].mean() for agent, columns in comparison.result.columns.items()}
+        means = {agent: columns[count.column].mean() for agent, columns in comparison.result.columns.items()}
         places = [k for k, agent in enumerate(agents) if agent in means]
         style = series_style(number) | {"linestyle": "none", "markersize": 6.0}
         axes.plot([means[agents[k]] for k in places], places, label=label_text(title.lower(), 22), **style)
     axes.set_yticks(range(len(agents)), [label_text(agent, 22) for agent in agents])
     axes.invert_yaxis()
-    axes.set(xlabel=TITLES[count], xlim=(0.0, None))
+    axes.set(xlabel=axis_title(count), xlim=(0.0, None))
     axes.tick_params(labelsize=8)
     named = axes.get_legend_handles_labels()
     figure.legend(*named, loc="outside upper right", ncols=3, fontsize=8, handletextpad=0.4, columnspacing=1)
@@ -137,9 +137,10 @@ def harm_above(compared: Comparison) -> Figure:
     """Draw, for every x, the share of worlds with a regret above x; with a harm above x, if no best harm is known."""
     result, best_known, counts = compared.result, BestKnown.of(compared.result), shown_counts(compared)
     figure, panels = new_panels((10.0, 3.8), columns=len(counts), sharey=True)
-    for axes, (count, harm) in zip(panels, counts.items(), strict=True):
+    for axes, count in zip(panels, counts, strict=True):
         for number, agent in enumerate(result.columns):
-            ordered = np.sort(result[agent][harm] if best_known is None else best_known.regret(result, agent, count))
+            values = result[agent][count.column] if best_known is None else best_known.regret(result, agent, count)
+            ordered = np.sort(values)
             chosen = np.linspace(0, len(ordered) - 1, min(POINTS, len(ordered))).astype(np.int64)
             at = np.append(0.0, ordered[chosen])
             share = 1.0 - np.searchsorted(ordered, at, "right") / len(ordered)
@@ -147,7 +148,7 @@ def harm_above(compared: Comparison) -> Figure:
         axes.set_xscale("symlog", linthresh=1.0, linscale=0.4)
         axes.xaxis.set_major_formatter(FuncFormatter(plain_number))
         what = "Harm" if best_known is None else "Regret"
-        axes.set(xlabel=f"{what}, {TITLES[count][0].lower()}{TITLES[count][1:]}", xlim=(0.0, None), ylim=(0.0, 1.0))
+        axes.set(xlabel=f"{what}, {count.words} (m²/s²)", xlim=(0.0, None), ylim=(0.0, 1.0))
     panels[0].set_ylabel("Worlds above this value")
     panels[0].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     note = f"Linear up to 1 m²/s², logarithmic beyond. {line(result)}."
@@ -156,21 +157,20 @@ def harm_above(compared: Comparison) -> Figure:
 
 def harm_against_total_gap(result: Result) -> Figure:
     """Draw each agent's mean harm against the sum of the gaps at the alert, in ``BINS`` groups of equal width."""
-    minimised = result.about.get("agent_settings", {}).get("harm_count", "first")
-    counts = ({**HARM, minimised: COLUMN[minimised]}).items()
+    minimised = HarmCount.of(result.about.get("agent_settings", {}).get("harm_count", HONEST))
     names = [name for name in result.worlds if name.startswith("gap_")]
     gap, by = np.sum([result.worlds[name] for name in names], axis=0), result.clusters
     part = np.minimum(((gap - gap.min()) / (np.ptp(gap) or 1.0) * BINS).astype(np.int64), BINS - 1)
     groups = [part == k for k in np.unique(part)]
     panels = {
-        TITLES[count]: {
+        axis_title(count): {
             agent: {
-                float(gap[group].mean()): mean(columns[harm][group], None if by is None else by[group])
+                float(gap[group].mean()): mean(columns[count.column][group], None if by is None else by[group])
                 for group in groups
             }
             for agent, columns in result.columns.items()
         }
-        for count, harm in counts
+        for count in dict.fromkeys([*IMPACT_COUNTS, minimised])
     }
     sums = " + ".join(f"d{p + 1}" for p in range(len(names))) if len(names) <= 3 else f"d1 + … + d{len(names)}"
     note = f"Mean over worlds with similar gaps; bands: 95 % intervals. {line(result)}."
@@ -194,7 +194,7 @@ def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float)
     braking, wait = np.ascontiguousarray(capacities(world.car, BRAKING)[0]), world.car[0, LATENCY].copy()
     priced: Any = harm_of_deceleration
     predicted = [priced(world.line[0], braking, wait, body, float(a)) for a in at]
-    return np.stack([predicted, *hold(world, world.wanted, [body], -at[None, :, None], horizon_s, "first")[:, 0]])
+    return np.stack([predicted, *hold(world, world.wanted, [body], -at[None, :, None], horizon_s, FIRST_IMPACTS)[:, 0]])
 
 
 @in_our_style
@@ -221,25 +221,25 @@ def deceleration_figure(
     styles = [series_style(number) | {"marker": "", "linewidth": 1.5} for number in range(3)]
     mark: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "clip_on": False, "zorder": 5}
     axes.plot(at, predicted, label="predicted (pairwise)", **styles[2])
-    for count, harm, style in zip(HARM, (first, total), styles, strict=False):
-        axes.plot(at, harm, label=f"simulated {IN_WORDS[count]}", **style)
+    for count, harm, style in zip(IMPACT_COUNTS, (first, total), styles, strict=False):
+        axes.plot(at, harm, label=f"simulated {count.words}", **style)
     axes.vlines(chosen, predicted[place], first[place], color=styles[2]["color"], linewidth=1.0, linestyle=":")
     harms = f"{predicted[place]:.2f} predicted, {first[place]:.2f} simulated"
     axes.plot(
         [chosen], [predicted[place]], label=f"a* = {chosen:.3f} m/s², closed form: {harms}",
         **{**styles[2], **mark, "marker": "D", "markersize": 6},
     )  # fmt: skip
-    for count, style, size in zip(HARM, styles, (6, 10), strict=False):
+    for count, style, size in zip(IMPACT_COUNTS, styles, (6, 10), strict=False):
         best = coupled(world, body, count, horizon_s)
         a, least = float(best.deceleration_mps2[0]), float(best.harm[0])
         axes.plot(
-            [a], [least], label=f"a* = {a:.3f} m/s², coupled, least {IN_WORDS[count]}: {least:.2f}",
+            [a], [least], label=f"a* = {a:.3f} m/s², coupled, least {count.words}: {least:.2f}",
             **{**style, **mark, "marker": "o", "markersize": size},
         )  # fmt: skip
         if best_known is not None:
             axes.axhline(
-                best_known[count],
-                label=f"best known {IN_WORDS[count]}: {best_known[count]:.2f}",
+                best_known[count.name],
+                label=f"best known {count.words}: {best_known[count.name]:.2f}",
                 **style | {"linewidth": 0.9},
             )
     axes.set(
@@ -268,7 +268,7 @@ def trajectories(
     scenario: AnyScenario | None = None,
     number: int = 0,
     seed: int = 7,
-    harm_count: str = "first",
+    harm_count: AnyCount = HONEST,
 ) -> Figure:
     """Draw positions, gaps and commands of agents in one world over time: one column for each agent, equal scales.
 
@@ -282,7 +282,7 @@ def trajectories(
     for k, (title, record) in enumerate(records.items()):
         for axes, draw in zip(panels[k::columns], (_positions, _gaps, _commands), strict=True):
             draw(axes, record)
-        harms = (float(record.last.harm(count)[0]) for count in ("first", "total"))
+        harms = (float(record.last.harm(count)[0]) for count in IMPACT_COUNTS)
         text = "{}\nharm {:.2f} first-impact, {:.2f} total".format(label_text(title), *harms)
         panels[k].set_title(text, fontsize=9.5)
         panels[-1 - k].set_xlabel("Time since Vehicle 1 began to brake (s)")

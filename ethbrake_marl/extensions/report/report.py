@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ethbrake_marl.agent_names import AGENTS, WRAPPERS
-from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
+from ethbrake_marl.episode.counts import ALL_IMPACTS, BUILT_IN_COUNTS, FIRST_IMPACTS, IMPACT_COUNTS, HarmCount
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.statistics import mean, rate
@@ -24,18 +24,21 @@ from ethbrake_marl.files.sheet import CellText, Column, Sheet
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Bools
 
-SHORT_TABLE = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of a short table, if they are shown
+SHORT_TABLE = (
+    "collision_rate",
+    *(count.column for count in BUILT_IN_COUNTS),
+    "pushed_mps",
+)  # columns of a short table, if they are shown
 LEARNED_AGENTS = ("trained policy", "trained team")  # names that get an article
 COUNTED_WORDS = {  # count -> verb, noun, and what is counted
-    "first": ("does", " harm", "first impacts"),
-    "total": ("does", " harm", "all impacts"),
-    "honest": ("costs", "", "honest cost"),
+    FIRST_IMPACTS: ("does", " harm", "first impacts"),
+    ALL_IMPACTS: ("does", " harm", "all impacts"),
 }
 
 
 def first_sentence(compared: Comparison, focus: str, tests: Mapping[str, Comparison]) -> str:
     """First sentence of the page: ``focus`` against full braking; also the ``tests`` in which it is not better."""
-    count, harm = compared.harm_count, COLUMN[compared.harm_count]
+    count, harm = compared.harm_count, compared.harm_count.column
     rows, best_known = {row.agent: row for row in compared.table}, BestKnown.of(compared.result)
     row, before = rows[focus], rows.get(BASELINE)
     name = "Full braking" if focus == BASELINE else f"The {focus}" if focus in LEARNED_AGENTS else focus
@@ -44,18 +47,18 @@ def first_sentence(compared: Comparison, focus: str, tests: Mapping[str, Compari
         if best_known is None or count not in best_known.harm
         else f"; best known {best_known.harm[count].mean():.2f}"
     )
-    does, of_harm, what = COUNTED_WORDS[count]
+    does, of_harm, what = COUNTED_WORDS.get(count, ("costs", "", count.words))
     if before is None or row is before:
-        total = f"; total harm: {value(row, HARM['total'])}" if count == "honest" else ""
+        total = f"; total harm: {value(row, ALL_IMPACTS.column)}" if count not in IMPACT_COUNTS else ""
         return (
             f"{name} {does} {value(row, harm)} m²/s²{of_harm and ' of'}{of_harm} per emergency ({what}{total}{best})."
         )
-    change, decrease = change_of(row, harm), row[f"harm_decrease_{count}"]
+    change, decrease = change_of(row, harm), row[f"harm_decrease_{count.name}"]
     much = "" if decrease is None else f"{abs(100.0 * decrease.value):.0f} % "  # None: full braking does none
     words = f"about as much{of_harm} as" if change == "as much" else f"{much}{change}{of_harm} than"
     numbers = f"{what}: {value(row, harm)} m²/s² per emergency instead of {value(before, harm)}{best}"
-    if count == "honest":
-        numbers += f"; total harm: {value(row, HARM['total'])} instead of {value(before, HARM['total'])}"
+    if count not in IMPACT_COUNTS:
+        numbers += f"; total harm: {value(row, ALL_IMPACTS.column)} instead of {value(before, ALL_IMPACTS.column)}"
     fails = []
     for title, comparison in tests.items():
         there = {test_row.agent: test_row for test_row in comparison.table}
@@ -139,7 +142,7 @@ class ReportPage:
         ]
         marks = "; marks: the other tests" if test_results else ""
         bars = harm_by_agent(compared, test_results)
-        words = IN_WORDS[compared.harm_count].capitalize()
+        words = compared.harm_count.words.capitalize()
         harm = drawing(bars, f"{words} of each agent", f"Mean and 95 % interval{marks}.")
         opening = [
             page_part("remarks", [*self.remarks, *rows.notes()]),
@@ -170,12 +173,12 @@ def agents_in_words(teams: Iterable[str]) -> dict[str, str]:
     return words
 
 
-def short_table(agents: SummaryTable, harm_count: str) -> Markup:
+def short_table(agents: SummaryTable, count: HarmCount) -> Markup:
     """Table of the most important columns. The count that agents minimise comes first, so that a phone shows it."""
-    sheet, first = agents.sheet(), COLUMN[harm_count]
-    chosen = [k for k, name in enumerate(sheet.names) if name in SHORT_TABLE]
-    chosen.sort(key=lambda k: sheet.names[k] != first)
-    return table(replace(sheet.only([0, *chosen]), title="Means with 95 % intervals, m²/s²"))
+    sheet = agents.sheet()
+    chosen = [k for k, name in enumerate(sheet.names) if name in (*SHORT_TABLE, count.column)]
+    chosen.sort(key=lambda k: sheet.names[k] != count.column)
+    return table(replace(sheet.only([0, *chosen]), title=f"{agents.heading}; means with 95 % intervals, m²/s²"))
 
 
 def measure_parts(agents: SummaryTable) -> list[Markup]:
@@ -189,10 +192,10 @@ def measure_parts(agents: SummaryTable) -> list[Markup]:
 def worst_section(compared: Comparison, focus: str, watched: Collection[int]) -> Section:
     """Worlds in which ``focus`` did worst. The rows ``watched`` get a button that starts the player."""
     result, known_best, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
-    counts = {**HARM, minimised: COLUMN[minimised]}
-    columns = {IN_WORDS[count].capitalize(): result[focus][column] for count, column in counts.items()}
+    counts = dict.fromkeys([*IMPACT_COUNTS, minimised])
+    columns = {count.words.capitalize(): result[focus][count.column] for count in counts}
     if known_best is not None:
-        columns |= {f"Best known, {count}": known_best.harm[count] for count in counts if count in known_best.harm}
+        columns |= {f"Best known, {count.name}": known_best.harm[count] for count in counts if count in known_best.harm}
         if known_best.unavoidable is not None:
             columns["An impact is"] = np.where(known_best.unavoidable, "unavoidable", "perhaps avoidable")
     columns["Impacts"] = result[focus]["impacts"]
@@ -201,7 +204,7 @@ def worst_section(compared: Comparison, focus: str, watched: Collection[int]) ->
         number = int(result.worlds["world"][k])
         name = CellText(page_part("watch", number)) if k in watched else number
         rows.append([name, *(values[k].item() for values in columns.values())])
-    by = IN_WORDS[minimised]
+    by = minimised.words
     if known_best is not None and minimised in known_best.harm:
         by = f"{by} minus the best known {by}"
     sheet = Sheet(f"Worlds of {focus}", list(map(Column, ("World", *columns))), rows)
@@ -236,7 +239,7 @@ def _harm_among(compared: Comparison, best_known: BestKnown, where: str, among: 
     some, rows = result.take(among), []
     for agent, harm_columns in some.columns.items():
         regrets = (best_known.regret(result, agent, count)[among] for count in counts)
-        harms = (harm_columns[column] for column in counts.values())
+        harms = (harm_columns[count.column] for count in counts)
         rows.append(
             (
                 agent,
@@ -244,7 +247,7 @@ def _harm_among(compared: Comparison, best_known: BestKnown, where: str, among: 
                 *(mean(x, some.clusters) for x in (*harms, *regrets)),
             )
         )
-    headings = [IN_WORDS[count] for count in counts]
+    headings = [count.words for count in counts]
     columns: list[Column | str] = [
         "Agent",
         Column("Collided", digits=1, scale=100.0, unit=" %"),
@@ -271,7 +274,7 @@ def write_evaluation(path: Path, compared: Comparison, command: str, *, force: b
         {
             "Command": command,
             "Agents": names,
-            "Agents minimise": IN_WORDS[compared.harm_count],
+            "Agents minimise": compared.harm_count.words,
             "Controlled by the agents": ", ".join(scenario.vehicle_names[body - 1] for body in scenario.learners),
             "Controlled by scripts": scripts or "none",
             "Time step, horizon": f"{scenario.time_step_s:g} s, {scenario.horizon_s:g} s",

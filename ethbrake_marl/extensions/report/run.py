@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
+from ethbrake_marl.episode.counts import IMPACT_COUNTS, HarmCount
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.results import write_results
@@ -22,7 +22,7 @@ from ethbrake_marl.extensions.report.best_known import REPORT_MEASURES
 from ethbrake_marl.extensions.report.figures import curves_figure, harm_against_total_gap, trajectories
 from ethbrake_marl.extensions.report.page import Section, drawing, table
 from ethbrake_marl.extensions.report.report import SHORT_TABLE, ReportPage, Test
-from ethbrake_marl.extensions.report.style import TITLES
+from ethbrake_marl.extensions.report.style import axis_title
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
 from ethbrake_marl.progress import OnProgress, Progress
@@ -98,8 +98,10 @@ def run_figures(experiment: Experiment) -> list[Markup]:
     typical_row = typical_row_of(compared, learned)
     world, number = compared.worlds([typical_row]), int(compared.result.worlds["world"][typical_row])
     plan = recipe.evaluation
-    counts = dict.fromkeys([*HARM, compared.harm_count])
-    curves = {**{TITLES[count]: COLUMN[count] for count in counts}, "Share of collisions": "collision_rate"}
+    curves = {
+        **{axis_title(count): count.column for count in _counts(compared)},
+        "Share of collisions": "collision_rate",
+    }
     course = (
         f"{training.scenario.name}: worlds 0 to {plan.worlds - 1} of the list of seed {plan.seed} at every point;"
         f" training seed {recipe.seed}."
@@ -143,7 +145,7 @@ def run_figures(experiment: Experiment) -> list[Markup]:
 
 def typical_row_of(compared: Comparison, learned: str) -> int:
     """Row with the median saving of harm among the worlds in which full braking does harm; 0 if there are none."""
-    harm = COLUMN[compared.harm_count]
+    harm = compared.harm_count.column
     before = compared.result[BASELINE][harm]
     rows = np.flatnonzero(before > 0.0)
     if not len(rows):
@@ -161,14 +163,14 @@ def report_page(
     steps = next(iter(trained.policies.values())).manifest.steps
     reward = recipe.reward.model_dump(exclude_defaults=True)
     if reward.keys() <= {"harm_count"}:
-        reward = {"minus the": IN_WORDS[recipe.reward.harm_count]}
+        reward = {"minus the": recipe.reward.harm_count.words}
     facts = {
         "Training": f"{recipe.title or recipe.name}, on {training.scenario.name}: {trained.steps:,} steps of"
         f" {recipe.total_steps:,} ({trained.status}), {trained.wall_s:.0f} s",
         "Seeds": f"training {recipe.seed}, evaluation list {compared.result.about['seed']}",
         "Reward": ", ".join(f"{key} {value}" for key, value in reward.items()),
         "Objective": training.objective,
-        "Agents minimise": IN_WORDS[compared.harm_count],
+        "Agents minimise": compared.harm_count.words,
         "Whole run": f"{time.monotonic() - experiment.started:.0f} s",
         "Settings": ", ".join(read_object(RunFolder(trained.directory).config).get("settings", ())),
     }
@@ -202,34 +204,34 @@ def learners_sheets(compared: Comparison) -> list[Sheet]:
     return [*(_borne_sheet(compared, count) for count in _counts(compared)), _added_sheet(compared)]
 
 
-def _counts(compared: Comparison) -> list[str]:
-    return [*dict.fromkeys([*HARM, compared.harm_count])]
+def _counts(compared: Comparison) -> list[HarmCount]:
+    return [*dict.fromkeys([*IMPACT_COUNTS, compared.harm_count])]
 
 
-def _borne_sheet(compared: Comparison, count: str) -> Sheet:
+def _borne_sheet(compared: Comparison, count: HarmCount) -> Sheet:
     scenario, by = compared.scenario, compared.result.clusters
     names = [name.replace("_", " ").capitalize() for name in scenario.vehicle_names]
     columns = [Column("Agent", "agent", text=True)]
     columns += [Column(heading, interval="hidden") for heading in (*names, "Whole line")]
     endings = [*(f"_{i + 1}" for i in range(len(names))), ""]
     rows: list[Row] = [
-        (agent, *(mean(harm_columns[COLUMN[count] + ending], by) for ending in endings))
+        (agent, *(mean(harm_columns[count.column + ending], by) for ending in endings))
         for agent, harm_columns in compared.result.columns.items()
     ]
     learn = ", ".join(names[body - 1] for body in scenario.learners)
-    return Sheet(f"Who bears what: {IN_WORDS[count]}, mean per world (m²/s²)", columns, rows, f"{learn} learn.")
+    return Sheet(f"Who bears what: {count.words}, mean per world (m²/s²)", columns, rows, f"{learn} learn.")
 
 
 def _added_sheet(compared: Comparison) -> Sheet:
     """Table of the harm that is added if a learner of the trained team brakes fully instead, for each learner."""
     result, counts, rows = compared.result, _counts(compared), list[Row]()
     for name in (compared.scenario.vehicle_names[body - 1] for body in compared.scenario.learners):
-        pairs = ((result[without(name)][COLUMN[count]], result[TEAM][COLUMN[count]]) for count in counts)
+        pairs = ((result[without(name)][count.column], result[TEAM][count.column]) for count in counts)
         rows.append(
             (name, *(difference(harm_without, team_harm, result.clusters) for harm_without, team_harm in pairs))
         )
     columns = [Column("Learner", text=True)]
-    columns += [Column(IN_WORDS[count].capitalize(), sign="+") for count in counts]
+    columns += [Column(count.words.capitalize(), sign="+") for count in counts]
     about = (
         "How much more harm there is without it: the vehicle brakes fully, and the others were not trained for that."
     )

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
 
-from ethbrake_marl.episode.counts import IN_WORDS
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.evaluation.summary import caption, ranges_of
@@ -59,7 +59,10 @@ STYLE: dict[str, Any] = {
 # Decorator of every function that draws a figure: a user's matplotlibrc or style has no effect on our figures.
 in_our_style = matplotlib.style.context(["default", STYLE])
 
-TITLES = {count: f"{words.capitalize()} (m²/s²)" for count, words in IN_WORDS.items()}
+
+def axis_title(count: HarmCount) -> str:
+    return f"{count.words.capitalize()} (m²/s²)"
+
 
 _CHARACTERS_PER_INCH = 17.0  # of a caption
 

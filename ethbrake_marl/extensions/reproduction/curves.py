@@ -10,9 +10,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import FIRST_IMPACTS
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import curves_figure
-from ethbrake_marl.extensions.report.style import TITLES
+from ethbrake_marl.extensions.report.style import axis_title
 from ethbrake_marl.extensions.reproduction.learning import RANDOM, courses_of, judge_trained, unconverged_policy
 from ethbrake_marl.extensions.reproduction.made import DRIVERS, DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import (
@@ -109,7 +110,7 @@ def show_harm(stem: str, title: str, readings: Mapping[str, Groups], legend: Seq
         for reading, curves in estimates.items()
     }
     text = "Mean first-impact harm of each strategy under each reading; bands: 95 % intervals."
-    figure = curves_figure(panels, x_label, f"{title}. {text}", y_label=TITLES["first"])
+    figure = curves_figure(panels, x_label, f"{title}. {text}", y_label=axis_title(FIRST_IMPACTS))
     sheets = [
         Sheet(
             f"{title}, {reading}",

@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import SHORT_NAMES
+from ethbrake_marl.episode.counts import FIRST_IMPACTS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import curve_over_seeds, curves_figure
-from ethbrake_marl.extensions.report.style import TITLES
+from ethbrake_marl.extensions.report.style import axis_title
 from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.verdicts import VERDICT_TOLERANCE, Claim, Less, judge
 from ethbrake_marl.files.plain import read_object
@@ -112,7 +112,7 @@ def planned_training(plan: TrainingPlan, seed: int) -> Training:
     scenario, recipe = eb.load_scenario(plan.scenario), eb.load_recipe(plan.recipe)
     if plan.mapped:
         scenario = scenario.replace(physics="paper-map")
-    reward = {**recipe.reward.model_dump(mode="json"), "harm_count": SHORT_NAMES["paper"]}
+    reward = {**recipe.reward.model_dump(mode="json"), "harm_count": "first"}
     if plan.terminal is not None:
         reward["terminal"] = plan.terminal
     return Training.of(recipe, scenario, reward=reward, seed=seed, total_steps=plan.decisions or recipe.total_steps)
@@ -315,7 +315,7 @@ def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
         "Mean return of training episodes": {
             name: curve_over_seeds(course.returns) for name, course in delay_courses.items()
         },
-        f"{TITLES['first']}, fixed list": {
+        f"{axis_title(FIRST_IMPACTS)}, fixed list": {
             name: curve_over_seeds(course.harm) for name, course in delay_courses.items()
         },
     }

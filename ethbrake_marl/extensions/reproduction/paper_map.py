@@ -35,7 +35,7 @@ import numpy as np
 
 from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.commands import check_actions, commands_of, proposal_array
-from ethbrake_marl.episode.counts import OF_FIRST, OF_PASSED, OF_TOTAL
+from ethbrake_marl.episode.counts import OF_FIRST, OF_TOTAL
 from ethbrake_marl.episode.departures import BACKWARD, MAP
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.reward import Rewarding, RewardParams
@@ -142,9 +142,13 @@ class PaperMap:
         Raises ``InvalidInput`` for the honest cost, push, driving and motion at the horizon, which need exact impacts.
         """
         counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
-        if game.settings.weights[OF_PASSED:].any() or counted:
-            what = f"the term {counted[0]}" if counted else "harm_count honest"
-            raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")
+        count = game.settings.harm_count
+        if count.requires or counted:
+            what = f"the term {counted[0]}" if counted else f"harm_count {count.name}"
+            right = "leave it out" if counted else "write harm_count first or total"
+            raise InvalidInput(
+                f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none; {right}"
+            )
         terms = tuple(
             (name, weight, partial(paper_collision, game.rewarding.params) if name == "collision" else function)
             for name, weight, function in game.rewarding.terms
@@ -182,7 +186,8 @@ class PaperMap:
         ends = after.ended & ~over
         out[TERMINATED], out[TRUNCATED] = ends & after.at_rest, ends & ~after.at_rest
         out[SAFE_END] = ends & ~after.collided
-        out[COST] = settings.weights[OF_FIRST] * out[FIRST_HARM] + settings.weights[OF_TOTAL] * out[TOTAL_HARM]
+        weights = settings.harm_count.weights
+        out[COST] = weights[OF_FIRST] * out[FIRST_HARM] + weights[OF_TOTAL] * out[TOTAL_HARM]
         shared = settings.terminal * out[SAFE_END] - settings.harm * out[COST]
         reward = np.repeat(shared[:, np.newaxis], state.vehicles, axis=1)
         return after, Step(reward, out, settings.time_step_s)

@@ -127,7 +127,7 @@ def reported_values(numbers: str, collided: Bools, harm: Floats, predicted: Floa
 
 @lru_cache(16)  # a table needs the worlds of one reading, and those for which E-V2X-BM plans
 def open_reading(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
-    scenario, game = open_game(worlds.scenario(worlds.base))
+    scenario, game = open_game(worlds.scenario(worlds.base), reward="harm")
     return scenario, game, scenario.sample(episodes, worlds.seed)
 
 

@@ -80,4 +80,4 @@ def process_outcomes(
 def proven_least_harm(reading: Reading, episodes: int) -> Floats:
     """Proven lower bound on the harm of every strategy in the worlds of ``reading``, for exact impacts, [n] m2/s2."""
     scenario, _, alert = open_reading(reading.only(*WORLD_FIELDS), episodes)
-    return lower_bound(alert, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s).harm
+    return lower_bound(alert, harm_count="first", horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s).harm

@@ -33,7 +33,7 @@ def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Recor
     records = {}
     for number in PAPER_SCENARIOS:
         scenario = reading.only("acts_s", "rear_s").scenario(f"paper-scenario-{number}")
-        for name, record in record_agents(scenario, dict(policies), seed=SEED).items():
+        for name, record in record_agents(scenario, dict(policies), seed=SEED, harm_count="first").items():
             records[name, number] = record
     return records
 

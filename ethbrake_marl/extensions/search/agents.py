@@ -11,6 +11,7 @@ import numpy as np
 from ethbrake_marl.agent_names import AgentSettings, make_agent
 from ethbrake_marl.agents.e_v2x_bm import Predicting
 from ethbrake_marl.agents.team import Agent, Team
+from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.state import FIRST_DECISION, State
@@ -27,7 +28,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 SEARCH_CANDIDATES = 500  # plans that +search simulates
 MOST_CANDIDATES = 1_000_000
-START = {"honest": "universal"}  # count -> policy whose commands ``best_harm`` improves, too
+START = {"honest": "universal"}  # name of a count -> policy whose commands ``best_harm`` improves, too
 OTHER_START = "ppo"  # the policy for every other count
 DECISION_ROUNDING = 1e-6  # part of a step: a time this close before a decision counts as the decision
 
@@ -46,13 +47,13 @@ class Planner(Predicting):
 
     knows = MODEL
 
-    def __init__(self, name: str, scenario: Scenario, count: str) -> None:
-        self.name, self.scenario, self.count = name, scenario, count
+    def __init__(self, name: str, scenario: Scenario, harm_count: AnyCount) -> None:
+        self.name, self.scenario, self.harm_count = name, scenario, HarmCount.of(harm_count)
 
     def begin(self, alert: State, body: int) -> SearchMemory:
         """Choose all commands. Raises ``InvalidInput`` if another vehicle's commands are not known at the alert."""
         game, alert = single_learner_game(self.scenario, alert, body)
-        problem = problem_of(game, alert, count=self.count, objective=self.scenario.objective)
+        problem = problem_of(game, alert, harm_count=self.harm_count, objective=self.scenario.objective)
         commands, harm = self.choose(game, alert, problem, body)
         return SearchMemory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
 
@@ -76,9 +77,9 @@ class BestHarm(Planner):
     """
 
     def __init__(
-        self, scenario: Scenario, count: str = "first", budget: int = SEARCH_BUDGET, name: str = "best_harm"
+        self, scenario: Scenario, harm_count: AnyCount = HONEST, budget: int = SEARCH_BUDGET, name: str = "best_harm"
     ) -> None:
-        super().__init__(name, scenario, count)
+        super().__init__(name, scenario, harm_count)
         self.budget = budget
 
     def check(self, game: Game, body: int) -> None:
@@ -88,7 +89,7 @@ class BestHarm(Planner):
             warnings.warn(f"{self.name}: searches every world: {outdated[game.name]}", Unfamiliar, stacklevel=2)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        known_harm, profiles = best_stored(problem, self.count)
+        known_harm, profiles = best_stored(problem, self.harm_count)
         commands = profiles.stepwise(int(problem.last_step.max()))[:, :, 0]
         harm = problem.value(problem.follow(profiles))
         some = (np.isinf(known_harm) | (self.scenario.objective != "total")).nonzero()[0]
@@ -103,12 +104,12 @@ class BestHarm(Planner):
         profiles, values = search_profiles(problem, [e_v2x_bm_profiles(problem, alert)], budget=self.budget)
         best = profiles.stepwise(steps)[:, :, 0]
         if self.scenario.learners != (body,):
-            return best, values[self.count]
-        start = START.get(self.count, OTHER_START)
+            return best, values[self.harm_count.name]
+        start = START.get(self.harm_count.name, OTHER_START)
         policy = make_agent(start, scenario=self.scenario)
         assert not isinstance(policy, Team)
         policy_commands = agent_commands(problem, game, alert, Team(start, {body: policy}))[:, :, 0]
-        better = refine(problem, policy_commands, budget=1)[1] < values[self.count]
+        better = refine(problem, policy_commands, budget=1)[1] < values[self.harm_count.name]
         first = np.where(better[:, np.newaxis], policy_commands, best[:, : policy_commands.shape[1]])
         best[:, : policy_commands.shape[1]], harm = refine(problem, first, budget=self.budget)
         return best, harm
@@ -118,10 +119,10 @@ class SearchAround(Planner):
     """Agent that improves another agent's commands by a search at the alert, so it never does more harm."""
 
     def __init__(
-        self, inner: Agent, scenario: Scenario, count: str = "first", candidates: int = SEARCH_CANDIDATES
+        self, inner: Agent, scenario: Scenario, harm_count: AnyCount = HONEST, candidates: int = SEARCH_CANDIDATES
     ) -> None:
         check_whole_number("search: candidates", candidates, 1, MOST_CANDIDATES)
-        super().__init__(f"{inner.name}+search", scenario, count)
+        super().__init__(f"{inner.name}+search", scenario, harm_count)
         self.inner, self.candidates = inner, candidates
 
     def check(self, game: Game, body: int) -> None:

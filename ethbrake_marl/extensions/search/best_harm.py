@@ -11,7 +11,7 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.team import Team, play
-from ethbrake_marl.episode.counts import COUNTS, HARM
+from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared
 from ethbrake_marl.episode.state import END, State
@@ -33,7 +33,7 @@ def best_harm(
     game: Game,
     alert: State,
     *,
-    counts: Sequence[str] = tuple(HARM),
+    harm_counts: Sequence[AnyCount] = (HONEST,),
     bodies: Sequence[int] | None = None,
     budget: int = SEARCH_BUDGET,
     seed: int = 0,
@@ -50,7 +50,7 @@ def best_harm(
     Args:
         game: game of the worlds' scenario.
         alert: worlds at the alert.
-        counts: counts of harm to search (``episode.counts``); each also tries the profiles of those before.
+        harm_counts: counts of harm to search (``episode.counts``); each also tries the profiles of those before.
         bodies: vehicles that are controlled (1: Vehicle 1); None: the learners.
         budget: number of profiles that are simulated in each world, for each count.
         seed: seed of the random search.
@@ -62,19 +62,23 @@ def best_harm(
     impacts.
 
     """
-    if not counts or not set(counts) <= set(COUNTS) or len(set(counts)) < len(counts):
-        raise InvalidInput(f"counts = {tuple(counts)}: must be some of {', '.join(COUNTS)}, each once")
+    counts = [HarmCount.of(count, "harm_counts: count") for count in harm_counts]
+    if not counts or len(set(counts)) < len(counts):
+        raise InvalidInput(f"harm_counts = {tuple(harm_counts)}: must be one or more counts of harm, each once")
     effort = {"budget": budget, "seed": seed, "threads": chosen_threads(threads)}
     problem = problem_of(game, alert, bodies, objective=objective)
-    outcomes = [(profiles, problem.values(profiles)) for profiles in first_profiles]
+    every_profile = [*first_profiles]
     for count in counts:
-        starts = [profiles for profiles, _ in outcomes]
-        outcomes.append(_search(game, alert, problem.with_count(count), starts, objective, effort))
+        every_profile.append(_search(game, alert, problem.with_count(count), every_profile, objective, effort)[0])
     names = [f"vehicle_{body}" for body in problem.bodies]
     header: dict[str, Any] = {"scenario": game.name, "vehicles": names, "budget": budget, "search_seed": seed}
     header["physics"] = physics_digest()
     header |= {} if objective == "total" else {"objective": objective}
-    best = {count: best_of([(values[count], profiles) for profiles, values in outcomes]) for count in counts}
+    header["weights"] = {count.name: count.weights.tolist() for count in counts}
+    ends = [(problem.follow(profiles), profiles) for profiles in every_profile]
+    best = {
+        count.name: best_of([(problem.value(last, count), profiles) for last, profiles in ends]) for count in counts
+    }
     harms, best_profiles = (
         {count: harm for count, (harm, _) in best.items()},
         {count: winners for count, (_, winners) in best.items()},
@@ -92,7 +96,9 @@ def _search(
 ) -> tuple[Profiles, dict[str, Floats]]:
     starts, bodies = starting_profiles(problem, alert, first_profiles), problem.bodies.tolist()
     for body in bodies if len(bodies) > 1 else ():
-        single_problem = problem_of(game, alert, [body], count=problem.harm_count, objective=objective, deciders=bodies)
+        single_problem = problem_of(
+            game, alert, [body], harm_count=problem.harm_count, objective=objective, deciders=bodies
+        )
         starts.append(
             beside_braking(problem, single_problem, _search(game, alert, single_problem, (), objective, effort)[0])
         )
@@ -151,7 +157,9 @@ def search_list(
         some = alert.take(slice(first, first + SEARCH_CHUNK))
         problem = problem_of(game, some, bodies)
         first_profiles = (
-            [] if known_table is None else [known_table.stored(problem, count)[1] for count in known_table.harm]
+            []
+            if known_table is None
+            else [known_table.stored(problem, HarmCount.of(count))[1] for count in known_table.harm]
         )
         first_profiles += [driven_profiles(problem, game, some, team) for team in teams]
         request = [repr(options).encode(), physics_digest().encode(), problem.identity.tobytes()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import COUNTS, HARM
+from ethbrake_marl.episode.counts import all_counts
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -21,7 +21,7 @@ def least_known_values(game: Game, alert: State) -> dict[str, Floats]:
     Raises ``InvalidInput`` if no count is.
     """
     problem = problem_of(game, alert)
-    least_values = {count: stored(problem, count)[0] for count in COUNTS}
+    least_values = {count.name: stored(problem, count)[0] for count in all_counts()}
     least_values = {count: values for count, values in least_values.items() if np.isfinite(values).all()}
     if not least_values:
         raise InvalidInput(f"measures limits: {_why_unknown(game.name)}; evaluate the agent best_harm beside yours")
@@ -55,24 +55,16 @@ def regret(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 SHARE = "How much of what the best known braking saves the agent saves: 0 % for full braking, 100 % for the best known."
-COUNT_HEADINGS = {"honest": "honest cost", "first": "first-impact", "total": "total"}  # in headings
 LIMITS = {
-    "best_known": Part(
-        best_known, unit="m2/s2",
-        statistics=tuple(Statistic(f"best_known_{count}", "mean", ending=count) for count in HARM),
-    ),
+    "best_known": Part(best_known, unit="m2/s2"),
     "regret": Part(
         regret, unit="m2/s2",
-        statistics=tuple(
-            statistic
-            for count, name in COUNT_HEADINGS.items()
-            for statistic in (
-                Statistic(f"regret_{count}", "mean", f"Regret, {name}", f"Regret\n{count}", count),
-                Statistic(
-                    f"share_of_possible_reduction_{count}", "decrease", f"Share of possible, {name}",
-                    f"Possible\n{count}", count, SHARE,
-                ),
-            )
+        statistics=(
+            Statistic("regret_{count}", "mean", "Regret, {words}", "Regret\n{count}", "{count}"),
+            Statistic(
+                "share_of_possible_reduction_{count}", "decrease", "Share of possible, {words}", "Possible\n{count}",
+                "{count}", SHARE,
+            ),
         ),
     ),
 }  # fmt: skip

@@ -14,7 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, pair_amount, unshared_amount, weights_of
+from ethbrake_marl.episode.counts import (
+    HONEST,
+    AnyCount,
+    HarmCount,
+    all_counts,
+    amount_so_far,
+    pair_amount,
+    unshared_amount,
+)
 from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
@@ -130,14 +138,14 @@ class Problem(NamedTuple):
     >>> from ethbrake_marl.extensions.search.pricing import problem_of
     >>> scenario, game = eb.open_game("paper-random")
     >>> problem = problem_of(game, scenario.sample(2, seed=7))
-    >>> problem.follow(problem.constant(problem.even_grid(3)[:, 1:2])).harm()
+    >>> problem.follow(problem.constant(problem.even_grid(3)[:, 1:2])).harm("first")
     array([80.51086128, 64.27142879])
     """
 
     bodies: Ints  # [B] vehicles that are controlled (1: Vehicle 1)
     state: State  # at the first decision; all other vehicles hold ``wanted``
     time_step_s: float
-    harm_count: str  # what is minimised (`episode.counts`)
+    harm_count: HarmCount  # what is minimised
     aim: float  # WHOLE_LINE, WEIGHTED or LARGEST
     shares: Floats  # [n, 3, N + 1] weights of what a pair's front and rear vehicle share, and of the rear's own amount
     identity: UInt64s  # [n] hash of everything that decides the harm of a profile (``identities``)
@@ -160,7 +168,7 @@ class Problem(NamedTuple):
     def take(self, rows: Any) -> Problem:
         return self._replace(state=self.state.take(rows), shares=self.shares[rows], identity=self.identity[rows])
 
-    def with_count(self, count: str) -> Problem:
+    def with_count(self, count: HarmCount) -> Problem:
         return self._replace(harm_count=count)
 
     def even_grid(self, number: int) -> Floats:
@@ -202,16 +210,16 @@ class Problem(NamedTuple):
             raise PhysicsError({k: "its profile could not be simulated" for k in np.flatnonzero(failed).tolist()})
         return State(line, car, clock, know, wanted, memories)
 
-    def value(self, last: State, count: str | None = None) -> Floats:
+    def value(self, last: State, count: HarmCount | None = None) -> Floats:
         """What the search minimises, for episodes with the last states ``last``, [n] m2/s2."""
-        value, weights = np.empty(self.n), weights_of(self.harm_count if count is None else count)
-        worths(last.line, self.shares, weights, self.aim, value)
+        value = np.empty(self.n)
+        worths(last.line, self.shares, (count or self.harm_count).weights, self.aim, value)
         return value
 
     def values(self, profiles: Profiles) -> dict[str, Floats]:
-        """What the search minimises if the vehicles follow ``profiles``, in every count of harm: count -> [n] m2/s2."""
+        """What the search minimises if the vehicles follow ``profiles``: name of a count of harm -> [n] m2/s2."""
         last = self.follow(profiles)
-        return {count: self.value(last, count) for count in COUNTS}
+        return {count.name: self.value(last, count) for count in all_counts(self.harm_count)}
 
     def with_weights(self, weights: Floats, *, largest: bool = False) -> Problem:
         """Problem of the sum (``largest``: the largest) of the vehicles' harms times ``weights`` [n, N]."""
@@ -248,7 +256,7 @@ def problem_of(
     alert: State,
     bodies: Sequence[int] | None = None,
     *,
-    count: str = "first",
+    harm_count: AnyCount = HONEST,
     objective: Declared = "total",
     deciders: Sequence[int] | None = None,
 ) -> Problem:
@@ -262,7 +270,7 @@ def problem_of(
     harm or ``maximin``, and a script that observes the state, whose commands are not known at the alert.
     """
     require(game.marked(alert), "a search for the best braking", SHOWN)
-    check_count("count", count)
+    count = HarmCount.of(harm_count)
     chosen = np.array(game.settings.learners if bodies is None else bodies, np.int64)
     if not len(chosen) or len(np.intersect1d(chosen, range(1, alert.vehicles + 1))) < len(chosen):
         raise InvalidInput(f"vehicles {chosen.tolist()}: must be one or more of 1 to {alert.vehicles}, each once")

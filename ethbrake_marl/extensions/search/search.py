@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import other_count, weights_of
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.extensions.search.kernels import CHANGE, DRAWING, PLAN, STEPWISE, Field, Room, World, gather, improve
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, UInt64s, best_of
@@ -39,7 +38,7 @@ PROFILES = np.zeros(DRAWING, np.int64)  # `drawing` of the kind PROFILE
 def search_profiles(
     problem: Problem, starts: Sequence[Profiles], *, budget: int, seed: int = 0, threads: int = 1
 ) -> tuple[Profiles, dict[str, Floats]]:
-    """Search each world for the best profile; return the profiles, and what they cost, count -> [n] m2/s2.
+    """Search each world for the best profile; return the profiles, and what they cost, name of a count -> [n] m2/s2.
 
     The result is at least as good as all of ``starts``, each with Q profiles for each world, [n * Q]: first those of
     world 0. ``budget``: about the number of profiles that are simulated in each world. The number of threads changes
@@ -229,8 +228,7 @@ def prepare_world(problem: Problem, k: int, random: UInt64s, phases: int, stepwi
     """The compiled search's form of world ``k``, and working memory for profiles of up to ``phases`` phases."""
     state = problem.state
     numbers = np.array([problem.time_step_s, problem.aim, stepwise])
-    count = problem.harm_count
-    weights = np.stack([weights_of(count), weights_of(other_count(count))])
+    weights = np.stack([problem.harm_count.weights, problem.harm_count.tie_breaker.weights])
     world = World(
         state.car[k], state.clock[k], state.wanted[k].copy(), problem.bodies, problem.bounds[k], problem.shares[k],
         numbers, weights, random[k : k + 1], scratch_for(state.wanted.shape[1]),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.counts import COUNTS
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, describe_error
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, UInt64s, best_of
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
@@ -36,11 +36,11 @@ class BestHarmTable:
     """Least known harm of n worlds in some counts of harm, with the profiles (commands over time) that reach it."""
 
     identity: UInt64s  # [n] hash of each world (``pricing.identities``)
-    harm: Mapping[str, Floats]  # count -> [n] m2/s2, or what else the search has minimised
+    harm: Mapping[str, Floats]  # name of a count -> [n] m2/s2, or what else the search has minimised
     profiles: Mapping[str, Profiles]  # count -> profiles with this harm
     header: Mapping[
         str, Any
-    ]  # how the table was made: scenario, vehicles, physics (its digest), budget, search_seed, ...
+    ]  # how the table was made: scenario, vehicles, physics (its digest), budget, search_seed, weights of counts, ...
 
     @classmethod
     def load(cls, path: Path) -> BestHarmTable:
@@ -53,7 +53,7 @@ class BestHarmTable:
             header = parse_strict_json(arrays.pop("header", np.zeros(0)).tobytes())
             if not isinstance(header, dict) or header.pop("format", None) is not TABLE_FORMAT:
                 raise ValueError(f"header: must be an object with the entry format: {TABLE_FORMAT}")
-            counts = [count for count in COUNTS if f"{count}_harm" in arrays]
+            counts = [name.removesuffix("_harm") for name in arrays if name.endswith("_harm")]
             _check(arrays, counts)
         except ValueError as error:
             raise CorruptBundle(f"{path}: is not a table of best known harm: {error}") from None
@@ -82,19 +82,21 @@ class BestHarmTable:
         rows = order[np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)]
         return np.where(self.identity[rows] == identity, rows, -1)
 
-    def stored(self, problem: Problem, count: str) -> tuple[Floats, Profiles]:
+    def stored(self, problem: Problem, count: HarmCount) -> tuple[Floats, Profiles]:
         """Least known harm of the problem's worlds, [n] m2/s2, and the profiles that reach it, [n].
 
-        A world that is not in the table has infinite harm and a profile that coasts.
+        A world that is not in the table has infinite harm and a profile that coasts, and so have all worlds if the
+        table was made for other weights of the count.
         """
+        weights = self.header.get("weights", {}).get(count.name, count.weights.tolist())
         rows = self.rows(problem.identity)
         in_table = rows >= 0
-        if count not in self.harm or not in_table.any():
+        if count.name not in self.harm or weights != count.weights.tolist() or not in_table.any():
             return np.full(problem.n, np.inf), problem.coasting()
-        ends, commands = self.profiles[count].take(rows)
+        ends, commands = self.profiles[count.name].take(rows)
         ends = np.where(in_table[:, np.newaxis], ends, problem.last_step[:, np.newaxis])
         profiles = Profiles(ends, np.where(in_table[:, np.newaxis, np.newaxis], commands, 0.0))
-        return np.where(in_table, self.harm[count][rows], np.inf), profiles
+        return np.where(in_table, self.harm[count.name][rows], np.inf), profiles
 
     def check_holds_any(self, identity: UInt64s) -> None:
         if not (self.rows(identity) >= 0).any():
@@ -127,7 +129,7 @@ def outdated_tables() -> dict[str, str]:
     }
 
 
-def best_stored(problem: Problem, count: str) -> tuple[Floats, Profiles]:
+def best_stored(problem: Problem, count: HarmCount) -> tuple[Floats, Profiles]:
     """As ``BestHarmTable.stored``, from all shipped tables."""
     results = [table.stored(problem, count) for table in shipped_tables()]
     nothing = np.full(problem.n, np.inf), problem.coasting()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import COLUMN
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS
 from ethbrake_marl.extensions.cooperation.ablation import Answer, LevelResult, can_imitate, least_known
 from ethbrake_marl.extensions.cooperation.levels import Level
 from ethbrake_marl.extensions.cooperation.results import comparison, levels_csv
@@ -18,17 +18,19 @@ from ethbrake_marl.motion.layout import FAR_M, GAP
 from tests.fixtures.commands import Command
 from tests.fixtures.pictures import draw_nothing
 
+NAMES, COLUMNS = zip(*((count.name, count.column) for count in BUILT_IN_COUNTS), strict=True)
+
 
 def columns(vehicles: list[list[float]]) -> dict[str, np.ndarray]:
     each = np.array([vehicles], np.float64)
-    borne = {f"{name}_{i + 1}": each[:, :, i] for name in COLUMN.values() for i in range(3)}
-    line = dict.fromkeys((*COLUMN.values(), "goal"), each.sum(axis=2))
+    borne = {f"{name}_{i + 1}": each[:, :, i] for name in COLUMNS for i in range(3)}
+    line = dict.fromkeys((*COLUMNS, "goal"), each.sum(axis=2))
     return {**borne, **line, "collided": each.any(axis=2)}
 
 
 def measured(level: str, vehicles: list[list[float]], algorithm: str | None, braking=None, before=None) -> LevelResult:
     scenario = eb.load_scenario(level)
-    best = dict.fromkeys(COLUMN, np.ones((1, len(vehicles))))
+    best = dict.fromkeys(NAMES, np.ones((1, len(vehicles))))
     worlds = scenario.sample(1, 0)
     return LevelResult(
         Level(level, scenario, before), algorithm, columns(vehicles), columns(braking or vehicles), worlds, best
@@ -42,7 +44,7 @@ def test_change__says_who_is_worse_off_and_by_how_much() -> None:
     )
     (step,) = comparison([before, after], 4)["steps"]
     assert (step["from"], step["to"], step["algorithm"]) == ("level-0-sensors", "cooperation-1-front", "ppo")
-    for count in COLUMN:
+    for count in NAMES:
         change = step[count]
         assert change["difference"]["value"] == pytest.approx((0 - 4 + 1 + 0) / 4)
         assert [each["value"] for each in change["vehicles"]] == pytest.approx([-0.25, -1.25, 0.75])
@@ -122,7 +124,7 @@ def test_ablation__trains_compares_and_goes_on(
     ethbrake: Command, empty_folder: Path, tiny_recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     draw_nothing(monkeypatch)
-    small = "--seeds 2 --steps 128 --episodes 12 --search-episodes 2 --set horizon_s=7 --set rules=honest"
+    small = "--seeds 2 --steps 128 --episodes 12 --search-episodes 2 --set horizon_s=7 --set reward.harm_count=honest"
     line = f"study ablate --levels level-0-sensors,cooperation-2-paper,cooperation-3-pair --recipes {tiny_recipe}"
     assert ethbrake(*line.split(), *small.split(), "--output", "out").status == 0
     out, found = Path("out"), json.loads(Path("out/ablation.json").read_text())
@@ -130,7 +132,7 @@ def test_ablation__trains_compares_and_goes_on(
     folders = [f"cooperation-{name}-seed{k}" for name in ("2-paper-tiny", "3-pair-tiny-shared") for k in (0, 1)]
     assert sorted(path.name for path in out.glob("trainings/*")) == folders
     config = json.loads((out / "trainings" / folders[0] / "config.json").read_text())
-    assert config["settings"] == ["horizon_s=7", "rules=honest"] and config["recipe"]["scheme"] is None
+    assert config["settings"] == ["horizon_s=7", "reward.harm_count=honest"] and config["recipe"]["scheme"] is None
     pair = json.loads((out / "trainings" / folders[2] / "config.json").read_text())["recipe"]
     assert (config["recipe"]["total_steps"], pair["total_steps"]) == (128, 256)
     for level in found["levels"][1:]:

@@ -7,7 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.team import Team, play_to_end
-from ethbrake_marl.episode.counts import COUNTS
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import difference, mean
 from ethbrake_marl.extensions.cooperation.front import (
@@ -37,7 +37,7 @@ def sampled() -> eb.State:
 
 @pytest.fixture(scope="module")
 def front() -> Front:
-    return search_front(PAPER, sampled(), WEIGHTS, count="first", budget=300, agents=AGENTS)
+    return search_front(PAPER, sampled(), WEIGHTS, harm_count="first", budget=300, agents=AGENTS)
 
 
 def preferring(row: np.ndarray) -> eb.Scenario:
@@ -73,7 +73,7 @@ def test_point__is_never_beaten_under_its_weights_by_another_point_a_constant_or
 
 def test_point__is_never_beaten_by_a_shipped_policy_that_was_not_given() -> None:
     obstacle, row = eb.load_scenario("paper-random-obstacle"), np.array([0.2, 0.8, 0.0])
-    found = search_front(obstacle, obstacle.sample(20, 777), [row], budget=30, count="total")
+    found = search_front(obstacle, obstacle.sample(20, 777), [row], budget=30, harm_count="total")
     scenario, game = eb.open_game(obstacle.replace(harm_weight=row.tolist(), objective="preference"))
     for name in ("universal", "vine-paper", "ppo"):
         last = play_to_end(game, scenario.sample(20, 777), Team(name, {2: eb.make_agent(name)}))
@@ -85,7 +85,7 @@ def test_agents__beside_the_front_bear_what_an_evaluation_says(spec: str, front:
     scenario, game = eb.open_game(preferring(WEIGHTS[4]))
     agent = eb.make_agent(spec, scenario=scenario)
     last = play_to_end(game, scenario.sample(20, 7), Team(spec, {2: agent}))
-    for count in COUNTS:
+    for count in (each.name for each in BUILT_IN_COUNTS):
         assert front.agents[spec][count][4].tolist() == last.borne_harm(count).tolist()
 
 
@@ -97,7 +97,7 @@ def test_agents__that_do_not_observe_the_weights_drive_once() -> None:
 
 
 def test_equal_weights__are_as_good_as_the_tables(front: Front) -> None:
-    known = best_stored(problem_of(eb.open_game(PAPER)[1], sampled()), "first")[0]
+    known = best_stored(problem_of(eb.open_game(PAPER)[1], sampled()), HarmCount.of("first"))[0]
     assert (front.borne["first"][3].sum(axis=1) <= known + 1e-9).all()
 
 
@@ -119,7 +119,7 @@ def test_front__does_not_depend_on_the_other_worlds_or_threads(front: Front, mon
     monkeypatch.setattr("ethbrake_marl.extensions.cooperation.front.FRONT_CHUNK", 2)
     some, heard = np.array([3, 17, 11]), []
     again = search_front(
-        PAPER, sampled().take(some), WEIGHTS, count="first", budget=300, agents=AGENTS, threads=3,
+        PAPER, sampled().take(some), WEIGHTS, harm_count="first", budget=300, agents=AGENTS, threads=3,
         on_progress=lambda *each: heard.append(each),
     )  # fmt: skip
     for count in ("first", "total"):
@@ -140,7 +140,7 @@ def test_two_learners__are_never_worse_than_one_nor_than_agents_that_drive_one_o
     agents = ["e_v2x_bm", "universal"]
     found, *alone = (
         search_front(
-            scenario, scenario.sample(8, 990801), rows, count=count, budget=60, agents=agents,
+            scenario, scenario.sample(8, 990801), rows, harm_count=count, budget=60, agents=agents,
             on_progress=lambda *each: heard.append(each),
         )
         for scenario in (pair, PAPER, pair.with_learners(["vehicle_3"]))
@@ -156,7 +156,7 @@ def test_learners__that_decide_at_other_times_alone_are_searched_too() -> None:
     """Alone, Vehicle 3 decides from 0.82 s on; with Vehicle 2 at 0.8 s and 0.9 s, which is not the same."""
     pair = eb.load_scenario("cooperation-3-pair").replace(latency_s=[0.0, 0.5, 0.82])
     worlds, braking = pair.sample(4, 3), full_braking(pair, pair.draw(4, 3))["first"]
-    found = search_front(pair, worlds, [[1, 1, 1]], budget=60, count="first")
+    found = search_front(pair, worlds, [[1, 1, 1]], budget=60, harm_count="first")
     assert (found.amounts[0] <= braking.sum(axis=1)).all()
 
 

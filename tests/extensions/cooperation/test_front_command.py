@@ -57,7 +57,7 @@ def test_front__refuses_before_any_work(refuse: Refuse, given: str, words: tuple
 
 @pytest.mark.filterwarnings("error")
 def test_front__without_any_harm_has_a_figure_and_no_warning(ethbrake: Command, empty_folder: Path) -> None:
-    line = "study front --weights 1,1,1 --episodes 3 --budget 50 --agents coast --set rules=paper --output out"
+    line = "study front --weights 1,1,1 --episodes 3 --budget 50 --agents coast --set harm_count=first --output out"
     answer = ethbrake(*line.split(), "--set", "gaps_m=1000")
     assert answer.status == 0 and Path("out/front.png").is_file(), answer.err
     assert json.loads(Path("out/front.json").read_text())["harm_count"] == "first"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import HONEST, HarmCount
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.evaluation.measure_registry import measures_called
@@ -70,7 +71,7 @@ def test_injuries__of_the_honest_cost_are_those_of_impacts() -> None:
     state = state_of([1000.0], [20.0, 20.0])
     last = later(state, [-6.0, 7.0], 2.0)
     injuries = objectives_of("injury:lr4s", 2)
-    assert amounts(injuries, state, last, "honest").tolist() == [[0.0, 0.0]] and last.harm("honest")[0] > 100.0
+    assert amounts(injuries, state, last, HONEST).tolist() == [[0.0, 0.0]] and last.harm("honest")[0] > 100.0
 
 
 @pytest.mark.parametrize("count", ["first", "total", "honest"])
@@ -82,7 +83,9 @@ def test_rewards__add_up_to_minus_the_injuries_of_the_last_state(count: str) -> 
     while not state.ended.all():
         state, step = game.step(state, actions)
         total += step.reward
-    assert total == pytest.approx(-amounts(objectives_of("injury:gidas", 3), None, state, count), abs=1e-9)
+    assert total == pytest.approx(
+        -amounts(objectives_of("injury:gidas", 3), None, state, HarmCount.of(count)), abs=1e-9
+    )
 
 
 def test_curve__is_named() -> None:

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import COUNTS
+from ethbrake_marl.episode.counts import FIRST_IMPACTS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.learners import vine
 from ethbrake_marl.extensions.learners.vine import Moment, play_on, stands_for_good
 from ethbrake_marl.motion.layout import FORCE
 
 TEAM = ["vehicle_2", "vehicle_3"]
-FIRST = COUNTS["first"]
+FIRST = FIRST_IMPACTS.weights
 
 
 def act(seen: np.ndarray) -> np.ndarray:

@@ -98,10 +98,7 @@ def test_command__shows_costs_relative_to_full_braking(ethbrake: Command, empty_
     )
     braking, trained = answer["fixed_list"]["results"]
     assert braking["objective"] == pytest.approx(1.0) and trained["objective"] != braking["objective"]
-    assert (
-        answer["next_command"]
-        == "ethbrake evaluate --scenario paper-random --agents full_brake,team@run --set rules=honest"
-    )
+    assert answer["next_command"] == "ethbrake evaluate --scenario paper-random --agents full_brake,team@run"
 
 
 def test_network__begins_as_a_policy_in_its_range_and_as_a_feature_elsewhere() -> None:

@@ -239,15 +239,19 @@ REFUSED = {
     "world 1 has a vehicle_1 that may brake only after the controlled vehicle": lambda: avoidability(
         changed("car", LATENCY, 1, 0.6)
     ),
-    "world 1 has a vehicle that moves backward": lambda: avoidability(changed("line", SPEED, 3, -1)),
+    "a proof does not cover backward, by which world 1 departs": lambda: avoidability(changed("line", SPEED, 3, -1)),
     "world 1 has an obstacle that vehicle_1 reaches although it brakes": lambda: avoidability(
         changed("line", GAP, 0, 8.0)
     ),
     "world 1 has an obstacle ahead of the controlled vehicle_1": lambda: avoidability(
         State.join([worlds(5, [9, 9], 5), worlds(5, [9, 9], 5, obstacle=90)]), 1
     ),
-    "world 1 has brakes that build up": lambda: avoidability(changed("car", BRAKE_RATE, 3, 9.0)),
-    "world 1 has brakes that build up, which": lambda: avoidability(changed("car", RELEASE_RATE, 1, 9.0)),
+    "a proof does not cover build-up, by which world 1 departs": lambda: avoidability(
+        changed("car", BRAKE_RATE, 3, 9.0)
+    ),
+    "a proof does not cover build-up, by which world 1 departs from the plain game": lambda: avoidability(
+        changed("car", RELEASE_RATE, 1, 9.0)
+    ),
 }
 
 

@@ -13,7 +13,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.record import advance_worlds
 from ethbrake_marl.extensions.proofs import line as row
 from ethbrake_marl.extensions.proofs.avoidability import FRONT, avoidability
-from ethbrake_marl.extensions.proofs.chain_search import triple_contact
+from ethbrake_marl.extensions.proofs.chain_search import first_boxes, triple_contact
 from ethbrake_marl.extensions.proofs.chains import (
     BOX_ROWS,
     EARLY,
@@ -145,20 +145,39 @@ def test_box__is_never_above_the_cost_of_a_chain_in_it():
     assert min((first[met] == kind).sum() for kind in (0, 1)) > 500
 
 
-TOUCHED = {  # kind of the first contact, at 20 m/s and at once -> world in which another contact follows after 1 s
-    FRONT_FIRST: lambda way: at(V_L=20, A_L=1e-9, V_F=20, GAP_R=30 - way, V_R=30),
-    REAR_FIRST: lambda way: at(GAP_L=way, V_L=0, A_L=5, V_F=20, V_R=20),
-}
+def test_box__of_a_world_in_which_a_touch_pushes_first():
+    """Vehicle 2 drives away from a touching Vehicle 3, brakes, and strikes Vehicle 1; then Vehicle 3 strikes it.
+
+    This is the first impact of the two: no push, although 4.8 m/s of its closing speed come from the brakes.
+    """
+    state = three(
+        [44.75, 0], [0, 20, 20], [2, 8, 8], [0, 0, 2.5], drive=[0, 3, 0], mass=[1, 10, 1], limit=60, restitution=0.1
+    )
+    plan = np.repeat([0.0, 3.0, 0.0, -8.0, 0.0, -8.0], [1, 8, 4, 9, 1, 1])
+    (first,), (box,), (cost,) = chains_of(state, plan[np.newaxis])
+    assert first == 1 and box[HARD] <= TOUCH_MPS and box[SOFT_2] == pytest.approx(15.2, abs=0.1)
+    assert cost - 20 < chain_cost(first, row.rows_of(state, 2, STEP_S)[0], box, HORIZON_S) <= cost
 
 
-@pytest.mark.parametrize("kind", TOUCHED)
-def test_touches__push_a_little_for_nothing(kind):
-    """Four of 1e-5 m/s in each of ten decisions and at both ends, of which half moves each of the pair: 0.24 mm."""
+# First contact at once, at 20 m/s; another after 1 s. Touches push with 48e-5 m/s; half of it moves each of the pair.
+TOUCHED = {  # world in which the place of the second contact is ``way`` ahead; how far that can be
+    "behind": (lambda way: at(GAP_L=way, V_L=0, A_L=5, V_F=20, V_R=20, LIMIT_F=40), REAR_FIRST, 20.00024),
+    "in front": (lambda way: at(V_L=20, A_L=1e-9, V_F=20, GAP_R=30 - way, V_R=30, LIMIT_F=40), FRONT_FIRST, 20.00024),
+    "in front, who follows keeps its speed limit": (
+        lambda way: at(V_L=20, A_L=1e-9, V_F=20, GAP_R=30 - way, V_R=30, LIMIT_F=20, U_F=1), FRONT_FIRST, 20.00048,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TOUCHED)
+def test_touches__push_a_little_for_nothing(name):
+    """Four of 1e-5 m/s in each of ten decisions and at both ends."""
+    make, kind, reach = TOUCHED[name]
     box = np.array([0, 0, 0, 0, 0, 0, 0, 1, 1, 10, 10]) + (kind == REAR_FIRST) * np.array([0] * 9 + [10, 10.0])
     costs = []
-    for way in (20.00023, 20.00025):
-        world = TOUCHED[kind](way)
-        world[[row.A_F, row.A_R, row.ONSET_R, row.LIMIT_F, row.TIME_STEP]] = 8, 4, 5, 40, STEP_S
+    for way in (reach - 1e-5, reach + 1e-5):
+        world = make(way)
+        world[[row.A_F, row.A_R, row.ONSET_R, row.TIME_STEP]] = 8, 4, 5, STEP_S
         world[[row.FRONT_SHARE, row.REAR_SHARE]] = 0.5
         costs.append(chain_cost(kind, world, box, HORIZON_S))
     assert box[SOFT_2] ** 2 <= costs[0] < 1000 and costs[1] == math.inf
@@ -192,7 +211,7 @@ def test_bound__of_a_plan_that_an_attacker_found():
         [0.258, 0.342], [21.623, 26.969, 24.376], [5.166, 6.106, 6.106], [0, 0, 0.626], drive=[0, 2.773, 0],
         mass=[11.38, 5.69, 4.173], limit=[60, 27.817, 60], restitution=0.5,
     )  # fmt: skip
-    bound = lower_bound(state, count="honest", horizon_s=12.0, time_step_s=0.1).harm[0]
+    bound = lower_bound(state, harm_count="honest", horizon_s=12.0, time_step_s=0.1).harm[0]
     game = eb.open_game(eb.load_scenario("paper-random").replace(horizon_s=12.0))[1]
     played = game.reset(with_braking(state, [1, 2, 3]))
     for command in [-6.106, 0.0, -6.106, -5.879, -1.376, -4.482, -4.978, -4.11, *[-6.106] * 112]:
@@ -206,6 +225,16 @@ def test_most_push__is_the_inverse_of_the_price(cost):
     world = at(BOUNCE=0.1)
     for touch, closing in ((False, 1.0), (True, 0.5 * TOUCH_MPS)):
         assert price_of(world, most_push(world, touch, cost), closing) == pytest.approx(cost, rel=1e-12)
+
+
+def test_first_boxes__contain_each_push_that_costs_at_most_the_best():
+    """900 m2/s2 are the price of 90 m/s; after a touch an impact of 5.5 m/s changes 6.05 m/s for 30.25 of them."""
+    state = three([44.75, 0.01], [0, 20, 20], [2, 8, 8], [0, 0, 2.5], drive=[0, 3, 0], mass=[1, 10, 1], restitution=0.1)
+    boxes, box = np.empty((BOX_ROWS, 64)), np.empty(BOX_ROWS)
+    count = first_boxes(REAR_FIRST, row.rows_of(state, 2, STEP_S)[0], 0.1, 0.9, True, 900.0, HORIZON_S, boxes, box)
+    touches = boxes[HARD, :count] <= TOUCH_MPS
+    assert {*boxes[MOST_PUSH, :count][touches].round(9)} == {93.025}
+    assert {*boxes[MOST_PUSH, :count][~touches].round(9)} == {90.0}
 
 
 @pytest.mark.nightly
@@ -241,11 +270,11 @@ def test_bound__is_near_the_best_known_cost_and_never_above_it(name):
     scenario = eb.load_scenario(name)
     worlds, steps = scenario.sample(30, seed=7), dict(horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
     best = BestHarmTable.load(TABLE_FOLDER / f"{name}.npz").harm["honest"][:30]
-    honest, total = (lower_bound(worlds, count=count, **steps) for count in ("honest", "total"))
+    honest, total = (lower_bound(worlds, harm_count=count, **steps) for count in ("honest", "total"))
     assert (honest.harm <= best + 1e-9).all() and honest.harm.mean() > LISTS[name][1] * best.mean()
     assert honest.harm[:6] == pytest.approx(LISTS[name][0], rel=1e-9)
     assert (honest.harm >= total.harm).all() and total.harm.mean() < 0.6 * best.mean()
-    any_time = [lower_bound(worlds, count=count, horizon_s=8.0).harm for count in ("honest", "total")]
+    any_time = [lower_bound(worlds, harm_count=count, horizon_s=8.0).harm for count in ("honest", "total")]
     assert np.array_equal(*any_time)
 
 
@@ -262,7 +291,7 @@ def test_condition__where_it_fails_the_bound_on_harm_remains(name):
     settings = dict(gaps=[7, 7], braking=[6, 7, 6], mass=[4.5, 5.5, 5.9], restitution=0.1) | CONDITIONS.get(name, {})
     gaps, braking = settings.pop("gaps"), settings.pop("braking")
     state = three(gaps, [18.0, 22.0, 22.0], braking, [0, 0, 0.3], drive=7.0, **settings)
-    honest, total = (lower_bound(state, count=count, time_step_s=0.1).harm[0] for count in ("honest", "total"))
+    honest, total = (lower_bound(state, harm_count=count, time_step_s=0.1).harm[0] for count in ("honest", "total"))
     assert honest > total + 1 if name == "covered" else honest == total
 
 

@@ -24,7 +24,7 @@ from tests.refused import refused
 
 
 def first_harm(state, switch, command):
-    return play(state, 2, np.array([switch]), np.array([command])).harm()[0]
+    return play(state, 2, np.array([switch]), np.array([command])).harm("first")[0]
 
 
 # world, controlled body -> squared closing speed that no commands undercut
@@ -63,7 +63,7 @@ def test_bound__is_never_above_what_its_own_optimum_reaches_in_steps(body, step)
     bound, outward = lower_bound(state, body).harm, rounding(state, body)
     steps = round(8.0 / step)
     times = np.tile(np.arange(steps) * step, (n, 1))
-    harm = play(state, body, times, np.repeat(capacity[:, [body - 1]], steps, axis=1)).harm()
+    harm = play(state, body, times, np.repeat(capacity[:, [body - 1]], steps, axis=1)).harm("first")
     attained = (harm > 0) & (harm - bound < 1e-6)
     assert attained.sum() > 500 and np.all(bound <= harm)
     # Most of what is subtracted is not needed, and all of it is little.
@@ -77,7 +77,7 @@ def test_both_pairs__add_up():
     assert (bound.front_pair[0], bound.rear_pair[0]) == pytest.approx((300, 400 - 2 * 5 * 1))
     assert bound.harm[0] >= bound.front_pair[0] + bound.rear_pair[0]
     state.line[:, HIT] = 1.0  # further impacts count in total harm, and the honest cost is never below it
-    first, total, honest = (lower_bound(state, count=count).harm[0] for count in ("first", "total", "honest"))
+    first, total, honest = (lower_bound(state, harm_count=count).harm[0] for count in ("first", "total", "honest"))
     assert first == 0.0 and honest == total == pytest.approx(bound.harm[0])
 
 
@@ -86,7 +86,7 @@ def test_early__impacts_before_the_latency_are_certain():
     bound = lower_bound(state)
     assert avoidability(state).reason_name[0] == "early" and bound.early[0] == pytest.approx(4)
     assert bound.front_pair[0] == 0  # hit: a further impact of this pair does not count first
-    assert lower_bound(state, count="total").early[0] == pytest.approx(4)
+    assert lower_bound(state, harm_count="total").early[0] == pytest.approx(4)
 
 
 # Recorded from version 0.5: the first worlds of seed 7, for commands at any time and at decisions.
@@ -124,7 +124,7 @@ def test_bound__no_searched_commands_are_below_it_and_some_are_near(rounds):
     state = state.take(~avoidability(state).avoidable)
     least = searched_harm(state, rounds, seed=41)
     for count in ("first", "total"):
-        bound = lower_bound(state, count=count, horizon_s=200.0)
+        bound = lower_bound(state, harm_count=count, horizon_s=200.0)
         assert np.all(bound.harm <= least[count])
         assert np.mean(bound.harm > 0.9 * least[count]) > 0.3  # the comparison has teeth
 
@@ -209,7 +209,7 @@ BOUNCES = {
 def test_after__is_nearly_attained_by_bouncing_off(name):
     kind, gaps, speeds, onset, command, harm = BOUNCES[name]
     state = worlds(gaps, speeds, [4, 8, 4], [0, 0, onset], drive=4, restitution=0.4)
-    assert play(state, 2, np.array([[0.0]]), np.array([[command]])).pair_harm()[0] == pytest.approx(harm)
+    assert play(state, 2, np.array([[0.0]]), np.array([[command]])).pair_harm("first")[0] == pytest.approx(harm)
     values = at(
         GAP_L=gaps[0], GAP_R=gaps[1], V_L=speeds[0], V_F=speeds[1], V_R=speeds[2], A_L=4, A_F=8, A_R=4, U_F=4,
         LIMIT_F=40, ONSET_R=onset, FRONT_SHARE=0.5, REAR_SHARE=0.5, BOUNCE=0.4,
@@ -308,7 +308,7 @@ def test_standing_vehicle__may_wait_before_it_drives():
 
 def test_combined__is_claimed_only_where_contact_is_unavoidable_and_not_early():
     state = wide_worlds(600, 3, seed=46)
-    reason, bound = avoidability(state).reason, lower_bound(state, count="total", horizon_s=200.0)
+    reason, bound = avoidability(state).reason, lower_bound(state, harm_count="total", horizon_s=200.0)
     assert np.all(bound.combined[reason < 2] == 0) and np.mean(bound.combined[reason >= 2] > 0) > 0.3
     assert np.all(bound.harm[reason == 0] == 0)
 
@@ -339,7 +339,7 @@ def test_who_stands_at_the_leader__is_struck_together_with_it(time_step_s, mass,
 
 THREE = worlds([7, 7], [20, 18, 20], [6, 7, 6], [0, 0.5, 0.8])
 REFUSED = {
-    "lower_bound: count = 'worst': must be 'first', 'total' or 'honest'": dict(count="worst"),
+    "lower_bound: harm_count = 'worst': must be 'first', 'total' or 'honest'": dict(harm_count="worst"),
     "lower_bound: horizon_s = 0.2: must be a finite number of at least 0.5": dict(horizon_s=0.2),
     "lower_bound: horizon_s = inf: must be a finite number of at least 0.5": dict(horizon_s=math.inf),
     "lower_bound: time_step_s = 0.0: must be a finite number of at least 0.001": dict(time_step_s=0.0),

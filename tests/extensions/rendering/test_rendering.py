@@ -192,7 +192,7 @@ def modes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> li
 
 
 def test_render_modes__are_those_that_work_here_and_the_checkers_of_libraries_pass(modes: list[str]) -> None:
-    made = gymnasium.make("EthBrake-v2")
+    made = gymnasium.make("EthBrake-v3")
     assert sorted(made.metadata["render_modes"]) == modes
     assert sorted(EthBrakeVectorEnv(2).metadata["render_modes"]) == ["ansi", "rgb_array"]  # not human
     assert sorted(EthBrakeParallelEnv.metadata["render_modes"]) == sorted(raw_env().metadata["render_modes"]) == modes
@@ -209,7 +209,7 @@ def test_human__with_the_module_of_another_package_names_both_packages(monkeypat
             environment.reset(seed=0)
         environment.close()
     with pytest.warns(UserWarning, match="HumanRendering wrapper"):
-        shown = gymnasium.make("EthBrake-v2", render_mode="human")
+        shown = gymnasium.make("EthBrake-v3", render_mode="human")
     shown.reset(seed=0)
     assert shown.step(np.zeros(1, np.float32))[1] == 0.0 and shown.render() is None
     shown.close()

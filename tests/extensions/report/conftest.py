@@ -7,7 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import teams_of
-from ethbrake_marl.episode.counts import HARM
+from ethbrake_marl.episode.counts import IMPACT_COUNTS
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.measures import Measure
 from ethbrake_marl.evaluation.summary import summarise
@@ -26,7 +26,7 @@ def with_best_known(compared: Comparison) -> Comparison:
     """Result with invented best known harm: half of these agents' least harm; avoidable where that is 0."""
     result = compared.result
     least = {
-        count: 0.5 * np.min([own[harm] for own in result.columns.values()], axis=0) for count, harm in HARM.items()
+        count: 0.5 * np.min([own[count.column] for own in result.columns.values()], axis=0) for count in IMPACT_COUNTS
     }
     more = {BEST[count]: value for count, value in least.items()}
     more[AVOIDABLE_COLUMN] = least["first"] == 0.0

@@ -10,7 +10,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import teams_of
-from ethbrake_marl.episode.counts import COLUMN
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.record import record_episodes
 from ethbrake_marl.extensions.report.best_known import UNAVOIDABLE
@@ -155,9 +155,13 @@ def test_worlds__to_watch_are_those_of_the_cost_that_the_agents_minimise(
     count: str, known: bool, compared: Comparison, searched: Comparison
 ) -> None:
     """They are the worlds of the first-impact harm if this had the values of the cost."""
-    mine = (searched if known else compared)._replace(harm_count=count)
+    mine = (searched if known else compared)._replace(harm_count=HarmCount.of(count))
     renamed = {
-        agent: {**own, "first_impact_harm": own[COLUMN[count]], "best_known_first": own.get(f"best_known_{count}", 0.0)}
+        agent: {
+            **own,
+            "first_impact_harm": own[HarmCount.of(count).column],
+            "best_known_first": own.get(f"best_known_{count}", 0.0),
+        }
         for agent, own in mine.result.columns.items()
     }
     other = mine._replace(result=replace(mine.result, columns=renamed), harm_count="first")

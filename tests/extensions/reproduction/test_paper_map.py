@@ -145,7 +145,7 @@ def test_k_energy__of_each_pair_in_exact_physics() -> None:
 
 
 def test_observation__is_the_state_of_the_paper() -> None:
-    env = eb.EthBrakeEnv("paper-random-map")
+    env = eb.EthBrakeEnv("paper-random-map", reward="harm")
     observation, _ = env.reset(seed=7)
     assert observation.shape == (8,)
     assert env.unwrapped.game.views[2].names == (
@@ -177,7 +177,7 @@ def test_early_impacts__are_refused() -> None:
 
 @pytest.mark.parametrize("agent", ["e_v2x_bm", "ppo+episode", "ppo+step", "best_harm", "universal"])
 def test_agents__that_plan_with_exact_impacts_are_refused(agent: str) -> None:
-    with refused("needs exact impacts, and these worlds have another physics"):
+    with refused("does not cover map, by which world 0 departs from the plain game"):
         eb.evaluate(MAPPED, agent, episodes=3)
 
 
@@ -194,7 +194,7 @@ MEASURES = (
 
 @pytest.mark.parametrize("measure", MEASURES)
 def test_measures__of_exact_impacts_are_refused(measure: str) -> None:
-    with refused("needs exact impacts, and these worlds have another physics"):
+    with refused("does not cover map, by which world 0 departs from the plain game"):
         eb.evaluate(MAPPED, "full_brake", episodes=3, measures=measure)
 
 
@@ -205,7 +205,14 @@ def test_results__have_no_honest_cost() -> None:
 
 @pytest.mark.parametrize(
     ("reward", "message"),
-    [("honest", "harm_count honest needs exact impacts"), ({"harm": 1.0, "push": 1.0}, "the term push needs exact")],
+    [
+        (
+            "shaped",
+            "harm_count honest needs exact impacts, and physics: paper-map has none; choose another reward, such",
+        ),
+        ("honest", "harm_count honest needs exact impacts"),
+        ({"harm": 1.0, "push": 1.0}, "the term push needs exact"),
+    ],
 )
 def test_rewards__of_exact_impacts_are_refused(reward, message: str) -> None:
     with refused(message):
@@ -213,13 +220,13 @@ def test_rewards__of_exact_impacts_are_refused(reward, message: str) -> None:
 
 
 def test_record__is_refused() -> None:
-    with refused("a record of the motion between decisions needs exact impacts"):
+    with refused("a record of the motion between decisions does not cover map"):
         eb.record_episode(MAPPED, "coast")
 
 
 def test_watch__is_refused() -> None:
-    with refused("a picture needs exact impacts"):
-        eb.EthBrakeEnv(MAPPED, render_mode="ansi").reset(seed=1)
+    with refused("a picture does not cover map"):
+        eb.EthBrakeEnv(MAPPED, render_mode="ansi", reward="harm").reset(seed=1)
 
 
 def test_mixture__has_one_physics() -> None:
@@ -235,21 +242,27 @@ def test_honest_cost__of_exact_impacts_is_missing() -> None:
     assert "honest_cost" not in eb.evaluate(MAPPED, "coast", episodes=3)["coast"]
     assert "honest_cost" in eb.evaluate(MAPPED.replace(physics=None), "coast", episodes=3)["coast"]
     for refusing in (MAPPED.sample(1, 7).harm, MAPPED.sample(1, 7).pair_harm, MAPPED.sample(1, 7).borne_harm):
-        with refused("the honest cost needs exact impacts"):
+        with refused("the honest cost does not cover map"):
             refusing("honest")
 
 
 def test_pictures__of_motion_between_samples_are_refused() -> None:
-    env = eb.EthBrakeEnv(MAPPED, render_mode="ansi")
-    with refused("a picture needs exact impacts"):
+    env = eb.EthBrakeEnv(MAPPED, render_mode="ansi", reward="harm")
+    with refused("a picture does not cover map"):
         env.reset(seed=7)
 
 
-def test_worlds__of_exact_impacts_are_refused() -> None:
-    """Agents that plan with exact impacts would drive in them, and nobody would see it."""
+def test_worlds__of_another_scenario_depart_by_the_map_or_are_refused() -> None:
     exact = eb.load_scenario("paper-random").sample(3, 7)
-    with refused("scenario 'paper-random-map': these worlds belong to a scenario with exact impacts"):
-        eb.evaluate(exact, "full_brake", scenario=MAPPED)
+    with refused("does not cover map, by which world 0 departs"):
+        eb.evaluate(exact, "e_v2x_bm", scenario=MAPPED)
+    message = (
+        "does not cover obstacle, by which world 0 departs from the plain game; departures that it covers: backward"
+    )
+    with refused(f"physics: paper-map {message}, map"):
+        eb.evaluate(eb.load_scenario("paper-random-obstacle").sample(3, 7), "full_brake", scenario=MAPPED)
+    with refused("scenario 'paper-random' does not cover map, by which world 0"):
+        eb.evaluate(MAPPED.sample(3, 7), "full_brake", scenario="paper-random")
 
 
 def test_tables__name_the_physics() -> None:

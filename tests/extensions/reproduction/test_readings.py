@@ -155,7 +155,7 @@ def test_scenario__has_what_the_reading_says() -> None:
 
 
 def test_map__has_no_coupled_bound() -> None:
-    with refused("needs exact impacts", InvalidInput):
+    with refused("does not cover map", InvalidInput):
         table_of(STATED._replace(step_s=0.2, hybrid="realised, by the coupled H*"), 2)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import COLUMN, HARM
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, IMPACT_COUNTS, HarmCount
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.extensions.search.agents import SearchAround
 from ethbrake_marl.training.experiment import usable
@@ -28,15 +28,18 @@ pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.Unfamiliar
 def test_planners__golden(name: str, agent: str, episodes: int, count: str, first: float, total: float) -> None:
     result = eb.evaluate(name, agent, episodes=episodes, harm_count=count)
     own = result[agent]
-    assert [own[column].mean() for column in HARM.values()] == pytest.approx([first, total], abs=5e-5)
-    assert own["predicted_harm"].tolist() == own[COLUMN[count]].tolist() and result.knows[agent] == "true model"
+    assert [own[each.column].mean() for each in IMPACT_COUNTS] == pytest.approx([first, total], abs=5e-5)
+    assert (
+        own["predicted_harm"].tolist() == own[HarmCount.of(count).column].tolist()
+        and result.knows[agent] == "true model"
+    )
 
 
-@pytest.mark.parametrize("count", COLUMN)
+@pytest.mark.parametrize("count", [count.name for count in BUILT_IN_COUNTS])
 def test_best_harm__of_no_table_is_never_worse_than_its_start_or_e_v2x_bm(count: str) -> None:
     start = "universal" if count == "honest" else "ppo"
     result = eb.evaluate("paper-random", f"{start},e_v2x_bm,best_harm:200", episodes=12, seed=5, harm_count=count)
-    best, policy, constant = (result[name][COLUMN[count]] for name in ("best_harm:200", start, "e_v2x_bm"))
+    best, policy, constant = (result[name][HarmCount.of(count).column] for name in ("best_harm:200", start, "e_v2x_bm"))
     assert (best <= policy).all() and (best < policy - 0.01).any()
     assert (best <= constant + 1e-9).all()
     assert result["best_harm:200"]["predicted_harm"].tolist() == best.tolist()
@@ -44,7 +47,7 @@ def test_best_harm__of_no_table_is_never_worse_than_its_start_or_e_v2x_bm(count:
 
 @pytest.mark.parametrize(("inside", "count"), [("constant:5", "first"), ("ppo", "total"), ("ppo", "honest")])
 def test_search_around__is_never_worse_and_better_with_more_candidates(inside: str, count: str) -> None:
-    agent, column = eb.make_agent(inside, scenario=PAPER), COLUMN[count]
+    agent, column = eb.make_agent(inside, scenario=PAPER), HarmCount.of(count).column
     agents = {"plain": agent, **{str(n): SearchAround(agent, PAPER, count, n) for n in (20, 200)}}
     result = eb.evaluate("paper-random", agents, episodes=30, seed=3, harm_count=count)
     plain, some, many = (result[name][column] for name in agents)
@@ -67,8 +70,10 @@ def test_planners__in_any_line_keep_what_they_predicted(name: str, changes: dict
     agents = "full_brake,best_harm:60,full_brake+search"
     result = eb.evaluate(scenario, agents, episodes=10, seed=4, harm_count=count)
     for agent in ("best_harm:60", "full_brake+search"):
-        assert result[agent]["predicted_harm"].tolist() == result[agent][COLUMN[count]].tolist()
-    assert (result["full_brake+search"][COLUMN[count]] <= result["full_brake"][COLUMN[count]]).all()
+        assert result[agent]["predicted_harm"].tolist() == result[agent][HarmCount.of(count).column].tolist()
+    assert (
+        result["full_brake+search"][HarmCount.of(count).column] <= result["full_brake"][HarmCount.of(count).column]
+    ).all()
 
 
 def test_planners__minimise_the_objective_of_the_scenario_also_in_worlds_of_a_table() -> None:

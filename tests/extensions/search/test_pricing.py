@@ -8,6 +8,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.team import Team, play_to_end
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.search.best_harm import driven_profiles
@@ -72,8 +73,8 @@ def test_follow__by_hand() -> None:
 )
 @pytest.mark.parametrize("count", ["first", "total"])
 def test_value__is_the_objective_of_the_controlled_vehicle(objective: str, count: str) -> None:
-    problem, _, last = driven("paper-random-obstacle", objective=objective, count=count)
-    expected = amounts(objectives_of(objective, 3), None, last, count)[:, int(problem.bodies[0]) - 1]
+    problem, _, last = driven("paper-random-obstacle", objective=objective, harm_count=count)
+    expected = amounts(objectives_of(objective, 3), None, last, HarmCount.of(count))[:, int(problem.bodies[0]) - 1]
     assert problem.value(last) == pytest.approx(expected, rel=1e-12) and (problem.value(last) > 0.0).any()
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import HONEST
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.search.best_harm import best_harm, search_list, starting_profiles
@@ -79,7 +80,7 @@ def grid(problem: Problem) -> Profiles:
 @pytest.mark.parametrize(("name", "objective", "count", "harm"), GOLDEN)
 def test_search__golden(name: str, objective: str, count: str, harm: list[float]) -> None:
     scenario, game = eb.open_game(name)
-    problem = problem_of(game, scenario.sample(6, seed=7), objective=objective, count=count)
+    problem = problem_of(game, scenario.sample(6, seed=7), objective=objective, harm_count=count)
     profiles, values = search_profiles(problem, [grid(problem)], budget=1000)
     assert values[count].tolist() == harm == problem.value(problem.follow(profiles)).tolist()
 
@@ -150,13 +151,13 @@ def test_search_list__continues_only_a_search_in_the_same_physics(tmp_path, requ
 def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_be_kept(tmp_path) -> None:
     scenario, game = eb.open_game("paper-random-obstacle")
     alert = scenario.sample(8, seed=7)
-    table, problem = best_harm(game, alert, counts=["honest"], budget=200, threads=1), problem_of(game, alert)
-    constant = eb.evaluate(alert, "e_v2x_bm", scenario=scenario, harm_count="honest")["e_v2x_bm"]["honest_cost"]
+    table, problem = best_harm(game, alert, harm_counts=["honest"], budget=200, threads=1), problem_of(game, alert)
+    constant = eb.evaluate(alert, "e_v2x_bm", scenario=scenario, harm_harm_count="honest")["e_v2x_bm"]["honest_cost"]
     assert (table.harm["honest"] <= constant + 1e-9).all() and (table.harm["honest"] < constant - 1.0).any()
     assert problem.values(table.profiles["honest"])["honest"].tolist() == table.harm["honest"].tolist()
     table.save(tmp_path / "honest.npz")
     again = BestHarmTable.load(tmp_path / "honest.npz")
-    assert again.stored(problem, "honest")[0].tolist() == table.harm["honest"].tolist() and [*again.harm] == ["honest"]
+    assert again.stored(problem, HONEST)[0].tolist() == table.harm["honest"].tolist() and [*again.harm] == ["honest"]
 
 
 @pytest.mark.parametrize("stepwise", [False, True])
@@ -173,10 +174,10 @@ def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool
 
 @pytest.mark.parametrize("objective", ["own", "weighted:1,4,2", "maximin"])
 def test_value__of_the_honest_cost_of_vehicles_is_the_amount_of_the_objective(objective: str) -> None:
-    problem = problem_of(GAME, sampled(), count="honest", objective=objective)
+    problem = problem_of(GAME, sampled(), harm_count="honest", objective=objective)
     last = problem.follow(problem.constant(problem.bounds[:, np.newaxis, :, 1]))
     assert last.line[:, MOVING].any(axis=1).all() and last.line[:, DROVE].any(axis=1).all()
-    assert problem.value(last) == pytest.approx(amounts(objectives_of(objective, 3), None, last, "honest")[:, 1])
+    assert problem.value(last) == pytest.approx(amounts(objectives_of(objective, 3), None, last, HONEST)[:, 1])
 
 
 def test_extremes__are_better_than_constants() -> None:
@@ -233,10 +234,10 @@ def test_search_list__goes_on_where_it_stopped(tmp_path, monkeypatch) -> None:
 
 REFUSED = {
     "budget = 0: must be a whole number": lambda: search_profiles(paper(), [grid(paper())], budget=0),
-    "count = 'best': must be 'first', 'total' or 'honest'": lambda: problem_of(GAME, sampled(), count="best"),
+    "harm_count = 'best': must be 'first', 'total' or 'honest'": lambda: problem_of(GAME, sampled(), harm_count="best"),
     "threads = 0: must be a whole number": lambda: search_profiles(paper(), [grid(paper())], budget=9, threads=0),
     "counts = ('first', 'first'): must be some of first, total, honest, each once": lambda: best_harm(
-        GAME, sampled(), counts=("first", "first")
+        GAME, sampled(), harm_counts=("first", "first")
     ),
     "vehicles [2, 3]: plans are searched for one controlled vehicle": lambda: refine(
         problem_of(GAME, sampled(), [2, 3]), steady(), budget=1

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.extensions.search.pricing import Problem, problem_of
@@ -58,9 +59,9 @@ def test_shipped__hold_the_first_worlds_of_their_list_with_the_harm_of_their_pro
     assert table.rows(problem.identity).tolist() == [*range(40)] and table.header["episodes"] == len(table.identity)
     for count, mean in zip(("first", "total"), MEANS[name], strict=True):
         assert table.harm[count].mean() == pytest.approx(mean, abs=6e-4)
-        harm, profiles = table.stored(problem, count)
+        harm, profiles = table.stored(problem, HarmCount.of(count))
         assert problem.values(profiles)[count] == pytest.approx(harm, abs=1e-9)
-        known, best = best_stored(problem, count)
+        known, best = best_stored(problem, HarmCount.of(count))
         assert (known <= harm).all() and problem.values(best)[count] == pytest.approx(known, abs=1e-9)
 
 
@@ -71,7 +72,7 @@ def test_shipped__of_a_task_have_the_honest_cost_alone(name: str) -> None:
     problem = problem_of(game, scenario.sample(40, seed=7))
     assert table.rows(problem.identity).tolist() == [*range(40)] and len(table.identity) == 2000
     assert {*table.harm} == {"honest"} and table.harm["honest"].mean() == pytest.approx(COSTS[name], abs=6e-4)
-    cost, profiles = table.stored(problem, "honest")
+    cost, profiles = table.stored(problem, HarmCount.of("honest"))
     assert problem.values(profiles)["honest"] == pytest.approx(cost, abs=1e-9)
     limits = eb.evaluate(name, "full_brake", episodes=40, measures="limits", harm_count="honest")["full_brake"]
     assert (limits["best_known_honest"] <= cost).all() and "best_known_first" not in limits  # of all tables the least
@@ -88,20 +89,20 @@ def test_shipped__are_for_this_physics_as_new_ones_are(table: BestHarmTable) -> 
 def test_shipped__are_not_used_under_another_impact_law(other_law: str) -> None:
     scenario, game = eb.open_game("paper-random")
     problem = problem_of(game, scenario.sample(5, seed=7))
-    assert shipped_tables() == () and np.isinf(best_stored(problem, "first")[0]).all()
+    assert shipped_tables() == () and np.isinf(best_stored(problem, HarmCount.of("first"))[0]).all()
     assert outdated_tables().keys() == (MEANS | COSTS).keys()
     assert outdated_tables()["paper-random"].endswith(f"than this installation's ({other_law!r})")
 
 
 def test_best_known__of_no_table_is_infinite_and_coasting() -> None:
-    harm, profiles = best_stored(paper(), "first")
+    harm, profiles = best_stored(paper(), HarmCount.of("first"))
     assert np.isinf(harm).all() and not profiles.commands_mps2.any()
     paper().check(profiles)
 
 
 def test_stored__where_a_table_holds_some_of_the_worlds(table: BestHarmTable) -> None:
     problem = problem_of(GAME, eb.State.join([SCENARIO.sample(2, seed=12), sampled().take([5])]))
-    harm, profiles = table.stored(problem, "total")
+    harm, profiles = table.stored(problem, HarmCount.of("total"))
     assert harm.tolist() == [np.inf, np.inf, table.harm["total"][5]]
     assert not profiles.commands_mps2[:2].any() and problem.values(profiles)["total"][2] == harm[2]
 
