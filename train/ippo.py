@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import IN_WORDS
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.errors import EthBrakeError, check_whole_number
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.training.own_team import save_team
@@ -177,7 +177,7 @@ def train(settings: Settings, folder: Path) -> None:
             learner.optimiser.param_groups[0]["lr"] = settings.learning_rate * (1.0 - k / updates)
             update(learner, rollouts[name], settings)
         if harms:
-            what = IN_WORDS[settings.harm_count]
+            what = COUNTS[settings.harm_count].words
             print(f"{(k + 1) * decisions:,} decisions: mean {what} of an episode {np.mean(harms):.2f}", flush=True)
     save_team(folder, learners, copies.envs[0], seed=settings.seed, steps=updates * decisions)
 

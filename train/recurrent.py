@@ -29,7 +29,7 @@ from safetensors.numpy import save_file
 from torch import Tensor, nn
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.files.store import new_folder
 
 # 1. Default observation, if the scenario has none: also the age of the news, and the vehicle's place in the line.
@@ -87,7 +87,7 @@ def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespac
         optimiser.step()
         if update % 10 == 9:
             mean = state.harm(args.harm_count).mean()
-            print(f"update {update + 1}: {IN_WORDS[args.harm_count]} {mean:.2f} m2/s2", flush=True)
+            print(f"update {update + 1}: {COUNTS[args.harm_count].words} {mean:.2f} m2/s2", flush=True)
     return network
 
 
@@ -123,7 +123,7 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=200)
     parser.add_argument("--worlds", type=int, default=256)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--harm-count", choices=COUNTS, default="honest", help="what the reward counts")
+    parser.add_argument("--harm-count", choices=[*COUNTS], default="honest", help="what the reward counts")
     parser.add_argument("--memoryless", action="store_true")
     args = parser.parse_args()
     scenario = eb.load_scenario(args.scenario)

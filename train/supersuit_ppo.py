@@ -183,7 +183,7 @@ if __name__ == "__main__":
     parser.add_argument("--scenario", default="cooperation-3-pair", help="a shipped scenario, or a YAML file")
     parser.add_argument("--steps", type=int, default=200_000, help="decisions of all learners together")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--harm-count", choices=COUNTS, default=REWARD["harm_count"], help="what the reward counts")
+    parser.add_argument("--harm-count", choices=[*COUNTS], default=REWARD["harm_count"], help="what the reward counts")
     parser.add_argument("--output", type=Path, default=Path("runs/supersuit"), help="new folder")
     given = parser.parse_args()
     try:

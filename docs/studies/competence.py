@@ -172,7 +172,7 @@ def search() -> None:
             game = open_game(scenario)[1]
             teams = make_teams(",".join((*AGENTS, POLICY)), scenario, harm_count="honest").values()
             found = search_list(
-                game, scenario.sample(WORLDS, SEED), counts=("honest",), budget=BUDGET, teams=teams, threads=1
+                game, scenario.sample(WORLDS, SEED), harm_counts=("honest",), budget=BUDGET, teams=teams, threads=1
             )
             costs[name] = float(found.harm["honest"].mean())
             BEST.write_text(json.dumps(costs, indent=1) + "\n")

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import COUNTS, HarmCount
+from ethbrake_marl.episode.counts import EXACT_IMPACTS, HONEST, HarmCount
 from ethbrake_marl.extensions.report.style import finish, in_our_style, new_panels, series_style, write_picture
 from ethbrake_marl.extensions.search.best_harm import e_v2x_bm_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, problem_of
@@ -55,16 +55,17 @@ class Cost(NamedTuple):
 
 def with_price(problem: Problem, price: float) -> Problem:
     """Problem that minimises total harm and the costs of a price."""
-    passed, _, *others = COUNTS["honest"][2:] if price else np.zeros(4)
-    COUNTS[f"a price of {price:g}"] = np.array([0.0, 1.0, passed, price, *others])
-    return problem.with_count(f"a price of {price:g}")
+    passed, _, *others = HONEST.weights[2:] if price else np.zeros(4)
+    weights = np.array([0.0, 1.0, passed, price, *others])
+    words = f"cost at a price of {price:g}"
+    return problem.with_count(HarmCount("priced", weights, "priced_cost", words, (EXACT_IMPACTS,)))
 
 
 def costs_of(test: str) -> list[Cost]:
     """Full braking, and for each price E-V2X-BM and the best known braking."""
     scenario, game = eb.open_game(test)
     alert = scenario.sample(WORLDS, SEED)
-    asked = problem_of(game, alert, count="total")
+    asked = problem_of(game, alert, harm_count="total")
     shipped = {price: best_stored(asked, HarmCount.of(count))[1] for price, count in SHIPPED.items()}
     found = [Cost.of("full_brake", 0.0, asked.follow(asked.constant(asked.bounds[:, np.newaxis, :, 0])))]
     for price in PRICES:

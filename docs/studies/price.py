@@ -57,7 +57,9 @@ def drive(scenario: eb.Scenario, n: int, lines: Mapping[str, dict[str, str]]) ->
     eb.register_measure("first_bound", first_bound, unit="m2/s2")
     agents = list(dict.fromkeys((*ALONE, *LIMITS, *LIMITS.values())))
     return {
-        name: eb.evaluate(scenario.replace(v2x=v2x), agents, episodes=n, seed=SEED, measures="first_bound")
+        name: eb.evaluate(
+            scenario.replace(v2x=v2x), agents, episodes=n, seed=SEED, measures="first_bound", harm_count="first"
+        )
         for name, v2x in lines.items()
     }
 

@@ -46,7 +46,7 @@ def train(block: str, seed: int) -> PPO:
     name, _, variant = block.partition("-")
     scenario, worlds, observation = BLOCKS[name]
     reward = {**SHAPED, "speed": 5e-4} if variant == "speed" else SHAPED
-    reward = {**reward, "harm_count": "honest"} if variant == "honest" else reward
+    reward = {**reward, "harm_count": "honest" if variant == "honest" else "first"}
     settings = {"horizon_is_end": False} if variant == "bootstrap" else {}
     venv = eb.make_sb3_vec_env(scenario, n_envs=worlds, observation=observation, reward=reward, **settings)
     return PPO("MlpPolicy", venv, n_steps=64, batch_size=512, learning_rate=1e-3, seed=seed).learn(STEPS)

@@ -25,7 +25,7 @@ def between(intervals: str, draws: int) -> str:
     """
     scenario, game = eb.open_game("paper-random")
     nominal, rng = scenario.sample(BOXES, 1), np.random.default_rng(1)
-    shield = RobustShield(uncertainty=intervals)
+    shield = RobustShield(uncertainty=intervals, harm_count="first")
     guarded = game._replace(shield=shield)
     state = guarded.reset(nominal)
     applied = np.full((BOXES, state.memories["shield"].plan.shape[1], 1), np.nan)
@@ -51,7 +51,7 @@ def between(intervals: str, draws: int) -> str:
 def beyond_horizon(proposer: str) -> str:
     """Count worlds above the bound if the episode ends at 3 s, once all vehicles have braked from then on to rest."""
     scenario, game = eb.open_game(eb.load_scenario("paper-random").replace(horizon_s=3.0))
-    team = eb.shield(eb.make_agent(proposer), scenario=scenario)
+    team = eb.shield(eb.make_agent(proposer), scenario=scenario, harm_count="first")
     last = eb.play_to_end(game, scenario.sample(2_000, 7), team)
     bound = last.memories["shield"].first
     later = eb.hold(last, -last.car[:, 3], [2], -last.car[:, np.newaxis, 3, [2]], 60.0, "first")[0, :, 0]

@@ -25,7 +25,7 @@ def test_tables__show_all_counts_and_say_which_one_agents_minimise(ethbrake: Com
     arguments = ("evaluate", "--episodes", "40", "--agents", "full_brake,e_v2x_bm,vine-paper")
     usual, paper = (ethbrake(*arguments, *more).out for more in ((), ("--set", "harm_count=first")))
     for shown in (usual, paper):
-        assert "First-impact        Total      Honest" in shown
+        assert {"First-impact", "Total", "Honest"} <= {*shown.split()}
     assert "Agents minimise honest cost" in usual and "Agents minimise first-impact harm" in paper
     assert "Push" in usual and "trained for first-impact harm" in usual and "trained for" not in paper
     line = "evaluate --scenario stress --episodes 2 --agents coast"

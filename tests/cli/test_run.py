@@ -66,7 +66,7 @@ def test_run__without_extensions_prints_the_tables_and_says_who_learned_what(
         "Trained on cooperation-3-pair by recipe tiny, seed 5: 256 decisions in "
     )
     assert "shielded team: the trained team (scheme independent) with a shield." in text
-    assert "All agents minimise first-impact harm, except that the trained team minimises own." in text
+    assert "All agents minimise honest cost, except that the trained team minimises own." in text
     assert "all but vehicle_3" in text and "Pushed" in text
     assert answer.err.splitlines()[-2:] == [
         f"results: {tmp_path / 'run' / 'results.json'}", f"finished after 256 training steps: {tmp_path / 'run'}"

@@ -69,14 +69,14 @@ def test_folder_that_exists__is_refused_before_torch_is_loaded(command: str, emp
     assert done.stdout == "2 False\n" and "mine: already exists and is not the folder of a run" in done.stderr
 
 
-def test_train__under_honest_rules_says_so_in_the_recipe_the_table_and_the_command(
+def test_train__for_another_count_says_so_in_the_recipe_the_table_and_the_command(
     ethbrake: Command, tiny_recipe: Path, empty_folder: Path
 ) -> None:
     answer = ethbrake("train", "--recipe", tiny_recipe, "--set", "harm_count=total", "--output", "runs/mine")
     config = json.loads(Path("runs/mine/config.json").read_text())
     assert config["recipe"]["reward"]["harm_count"] == "total" and config["settings"] == ["harm_count=total"]
     assert answer.out.splitlines()[-1].endswith("--agents full_brake,policy@runs/mine --set harm_count=total")
-    assert "Honest cost" in answer.out and "honest cost " in answer.err
+    assert "Honest cost" in answer.out and "total harm " in answer.err
 
 
 def test_train__of_several_learners_leaves_a_team_that_evaluate_takes(

@@ -71,7 +71,7 @@ def test_objectives__are_measured_in_every_count_and_once_unless_vehicles_differ
 def test_worst5__is_the_mean_of_the_worst_worlds_in_every_count() -> None:
     result = eb.evaluate("paper-random", "full_brake", episodes=100, measures="worst5", harm_count="honest")
     (row,) = eb.summarise(result)
-    for count, column in ((each, each.column) for each in BUILT_IN_COUNTS):
+    for count, column in ((each.name, each.column) for each in BUILT_IN_COUNTS):
         last_five = np.sort(result["full_brake"][column])[-5:]
         assert row[f"worst5_{count}"].value == pytest.approx(last_five.mean()) and row[f"worst5_{count}"].interval
 
@@ -278,7 +278,7 @@ def test_measures_of_two_files_with_one_name__stand_side_by_side_and_one_after_t
     (row,) = table = summarise(result)
     keys = ("mine.py:worst", "b/mine.py:worst", "mine.py:near_rate", "b/mine.py:near_rate")
     assert [row.estimates[key].value for key in keys] == [1.0, 2.0, 0.0, 1.0]  # type: ignore[union-attr]
-    assert table.sheet().names[5:7] == ["mine.py:near_rate", "b/mine.py:near_rate"]
+    assert table.sheet().names[6:8] == ["mine.py:near_rate", "b/mine.py:near_rate"]
     assert {"Near (mine.py)", "Near (b/mine.py)"} < table.meanings().keys()
     assert [cells[0] for cells in table.measures().rows] == ["mine.py:worst (1)", "b/mine.py:worst (1)"]  # type: ignore[union-attr]
 
@@ -489,10 +489,10 @@ def test_our_agents__are_sent_to_processes_and_report_what_they_predict(monkeypa
     one, two = (evaluate_teams(scenario.draw(80, 7), agents, game, jobs=jobs) for jobs in (1, 2))
     for name, columns in one.columns.items():
         assert all((two[name][key] == column).all() for key, column in columns.items())
-    assert one["e_v2x_bm"]["predicted_harm"].tolist() == one["e_v2x_bm"]["first_impact_harm"].tolist()
+    assert one["e_v2x_bm"]["predicted_harm"].tolist() == one["e_v2x_bm"]["honest_cost"].tolist()
     assert one["ppo+step"]["replaced_none"].tolist() == (one["ppo+step"]["replaced_actions"] == 0).tolist()
-    least = np.minimum(one["ppo"]["first_impact_harm"], one["e_v2x_bm"]["first_impact_harm"])
-    assert one["ppo+episode"]["first_impact_harm"].tolist() == least.tolist()
+    least = np.minimum(one["ppo"]["honest_cost"], one["e_v2x_bm"]["honest_cost"])
+    assert one["ppo+episode"]["honest_cost"].tolist() == least.tolist()
     assert summarise(one)[3]["policy_share"] == rate(one["ppo+episode"]["replaced_none"])
     assert one.knows["ppo+step"] == "messages + true model" and one.policies["ppo+step"] == one.policies["ppo"] != {}
 

@@ -103,11 +103,11 @@ def test_terminal_of_80__shows_both_harms_with_intervals_and_what_was_asked_for(
 ) -> None:
     text = at(80, summarise(result), monkeypatch)
     head = " ".join(text.splitlines()[0].split())
-    assert head == "Agent, First-impact Total Push Pushed Pushed Decrease"
+    assert head == "Agent, First-impact Total Honest Push Pushed"
     assert "constant:4.0 ‡" in text and "own sensors" in text and "95 % interval" in text
     narrow = at(56, summarise(result), monkeypatch)
     assert "Total" in narrow and "First-impact" in narrow and "Push" not in narrow
-    assert "Decrease" in at(120, summarise(result), monkeypatch)
+    assert "Decrease" in at(140, summarise(result), monkeypatch)
 
 
 @pytest.mark.parametrize("where", ["script", "terminal", "notebook", "redirected"])
@@ -185,8 +185,8 @@ def test_mixed_team__says_who_drives_which_vehicle(monkeypatch: pytest.MonkeyPat
     teams = {"mixed": {"vehicle_2": "coast", "vehicle_3": "constant:4"}, "alike": "coast"}
     table = summarise(eb.evaluate("cooperation-3-pair", teams, episodes=2))
     lines = [line.split("  ")[0].rstrip() for line in at(80, table, monkeypatch).splitlines()]
-    assert lines[3:7] == ["mixed", "own sensors", "vehicle_2: coast", "vehicle_3: constant:4"]
-    assert "vehicle_2: coast" not in lines[7:] and table[0].to_json()["drivers"]["vehicle_3"] == "constant:4"
+    assert lines[4:8] == ["mixed", "own sensors", "vehicle_2: coast", "vehicle_3: constant:4"]
+    assert "vehicle_2: coast" not in lines[8:] and table[0].to_json()["drivers"]["vehicle_3"] == "constant:4"
 
 
 # ---- below the table
@@ -199,7 +199,7 @@ def pushing(pushed_m: float, moving: int) -> SummaryTable:
     mine = {**result["full_brake"], "pushed_m_1": np.linspace(0.0, 2.0 * pushed_m, 20), "ended": ends}
     columns = {"full_brake": result["full_brake"], "mine": mine}
     both: dict[str, Any] = {"knows": dict.fromkeys(columns, "")} | {
-        field: {key: {} for key in columns} for field in ("drivers", "policies")
+        field: {key: {} for key in columns} for field in ("drivers", "policies", "remarks")
     }
     return summarise(replace(result, columns=columns, **both))
 
@@ -256,8 +256,8 @@ def test_lists__stand_below_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     text = terminal_text(summarise_lists({name: summarise(each) for name, each in results.items()}, results))
     rows = [line.split() for line in text.splitlines() if line.startswith(("pair", "far", "full"))]
     assert rows == [
-        ["pair"], ["full_brake", "failed", "100.0", "%", "10.8", "9.00", "9.00"],
-        ["far"], ["full_brake", "passed", "0.0", "%", "0.0", "0.00", "0.00"],
+        ["pair"], ["full_brake", "failed", "100.0", "%", "10.8", "9.00", "9.00", "9.00"],
+        ["far"], ["full_brake", "passed", "0.0", "%", "0.0", "0.00", "0.00", "0.00"],
     ]  # fmt: skip
 
 
@@ -278,6 +278,7 @@ def test_lists__of_worlds_that_differ_show_the_worst_impact_and_the_mean_harm() 
                 pytest.approx(3.6 * max(own["hardest_impact_mps"].tolist())),
                 pytest.approx(own["first_impact_harm"].mean()),
                 pytest.approx(own["total_harm"].mean()),
+                pytest.approx(own["honest_cost"].mean()),
             )
     assert one["full_brake"]["collided"].tolist() == [True, False, False, False]
 

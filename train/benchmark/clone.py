@@ -30,7 +30,7 @@ def demonstrations(task: eb.Scenario, seed: int, decisions: int) -> tuple[Tensor
     first = 0
     while sum(map(len, actions)) < decisions:
         worlds = task.draw(200, seed, first=first, purpose="training").worlds
-        table = search_list(game, worlds, counts=("honest",), budget=CANDIDATES, seed=seed, threads=1)
+        table = search_list(game, worlds, harm_counts=("honest",), budget=CANDIDATES, seed=seed, threads=1)
         problem = problem_of(game, worlds)
         commands = table.profiles["honest"].stepwise(int(problem.last_step.max()))
         state = game.reset(worlds)

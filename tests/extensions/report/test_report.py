@@ -10,7 +10,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import teams_of
-from ethbrake_marl.episode.counts import HarmCount
+from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST, HarmCount
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.record import record_episodes
 from ethbrake_marl.extensions.report.best_known import UNAVOIDABLE
@@ -103,7 +103,7 @@ def test_page__of_the_honest_cost_shows_it_beside_both_harms() -> None:
 def test_first_sentence__flatters_nobody(compared: Comparison) -> None:
     def about(agents: str, **changes: Any) -> str:
         loaded = eb.load_scenario("paper-random").replace(**changes)
-        found = Comparison.of(loaded, teams_of(agents, loaded), episodes=60, seed=7)
+        found = Comparison.of(loaded, teams_of(agents, loaded), harm_count="first", episodes=60, seed=7)
         return first_sentence(found, agents.rpartition(",")[2], {})
 
     assert " % more harm than full braking (" in about("full_brake,coast")
@@ -139,11 +139,11 @@ def test_shown__begin_with_the_worst(compared: Comparison, searched: Comparison)
 
 
 def test_worlds__are_ranked_by_what_the_agents_minimise(compared: Comparison, searched: Comparison) -> None:
-    honest, cost = compared._replace(harm_count="honest"), compared.result["ppo"]["honest_cost"]
+    honest, cost = compared._replace(harm_count=HONEST), compared.result["ppo"]["honest_cost"]
     assert cost[worst_rows(honest, "ppo")].tolist() == sorted(cost, reverse=True)[:10]
     section = " ".join(map(str, worst_section(honest, "ppo", ()).body))
     assert "did worst, by honest cost." in section and section.count("Honest cost") == 1
-    unknown = searched._replace(harm_count="honest")  # no best known honest cost
+    unknown = searched._replace(harm_count=HONEST)  # no best known honest cost
     assert worst_rows(unknown, "ppo").tolist() == worst_rows(honest, "ppo").tolist()
     section = " ".join(map(str, worst_section(unknown, "ppo", ()).body))
     assert "by honest cost." in section and section.count("Honest cost") == 1
@@ -164,11 +164,11 @@ def test_worlds__to_watch_are_those_of_the_cost_that_the_agents_minimise(
         }
         for agent, own in mine.result.columns.items()
     }
-    other = mine._replace(result=replace(mine.result, columns=renamed), harm_count="first")
+    other = mine._replace(result=replace(mine.result, columns=renamed), harm_count=FIRST_IMPACTS)
     for focus in ("ppo", FOCUS, "full_brake"):
         chosen = shown_worlds(mine, focus)
         assert chosen == shown_worlds(other, focus)
-        assert chosen != shown_worlds(mine._replace(harm_count="first"), focus)
+        assert chosen != shown_worlds(mine._replace(harm_count=FIRST_IMPACTS), focus)
 
 
 def test_worst_worlds__can_be_watched(searched: Comparison) -> None:
@@ -322,7 +322,7 @@ def test_page__hostile_names_are_text_everywhere() -> None:
 
 def test_first_table__begins_with_the_count_that_agents_minimise() -> None:
     for count, words in (("honest", "Honest cost"), ("total", "Total harm")):
-        text = str(short_table(compared_by("paper-random", "full_brake,coast", 20, count).table, count))
+        text = str(short_table(compared_by("paper-random", "full_brake,coast", 20, count).table, HarmCount.of(count)))
         assert re.findall(r'<th scope="col">([^<]+)</th>', text)[:2] == ["Agent", words]
 
 

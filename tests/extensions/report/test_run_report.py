@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import ALL_IMPACTS, HONEST
 from ethbrake_marl.errors import EXTRA_OF
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.extensions.report.run import TESTS, learners_sheets, other_tests, short_sheet, typical_row_of
@@ -84,18 +85,18 @@ def test_several_learners__who_bears_what_and_what_each_adds(tmp_path: Path) -> 
     recipe = TINY.replace(total_steps=256, scheme="shared", reward={"harm": 1.0})
     scenario = eb.load_scenario("cooperation-3-pair")
     compared = run_experiment(recipe, scenario, tmp_path / "run", episodes=12)[0].compared
-    first, total, added = learners_sheets(compared)
+    first, total, _, added = learners_sheets(compared)
     for sheet, harm in ((first, "first_impact_harm"), (total, "total_harm")):
         for agent, *cells in sheet.rows:
             means = [compared.result[agent][f"{harm}{ending}"].mean() for ending in ("_1", "_2", "_3", "")]
             assert [cell.value for cell in cells] == pytest.approx(means)
             assert sum(cell.value for cell in cells[:3]) == pytest.approx(cells[3].value)
     assert first.headings[1:] == ["Vehicle 1", "Vehicle 2", "Vehicle 3", "Whole line"]
-    for name, less, _ in added.rows:
+    for name, less, *_ in added.rows:
         mine = [compared.result[each]["first_impact_harm"] for each in (f"all but {name}", "trained team")]
         assert less.value == pytest.approx((mine[0] - mine[1]).mean())
     assert [row[0] for row in added.rows] == ["vehicle_2", "vehicle_3"]
-    *_, cost, more = learners_sheets(compared._replace(harm_count="honest"))
+    *_, cost, more = learners_sheets(compared._replace(harm_count=HONEST))
     means = [compared.result["full_brake"][f"honest_cost{ending}"].mean() for ending in ("_1", "_2", "_3", "")]
     assert [cell.value for cell in cost.rows[0][1:]] == pytest.approx(means)
     assert more.headings[-1] == "Honest cost"
@@ -114,7 +115,7 @@ def test_several_learners__who_bears_what_and_what_each_adds(tmp_path: Path) -> 
 )
 def test_typical_row__is_the_median_saving_among_harmful_worlds(before: Any, after: Any, row: int) -> None:
     result = {"full_brake": {"total_harm": np.array(before)}, "mine": {"total_harm": np.array(after)}}
-    assert typical_row_of(Comparison(None, {}, result, None, "total"), "mine") == row  # type: ignore[arg-type]
+    assert typical_row_of(Comparison(None, {}, result, None, ALL_IMPACTS), "mine") == row  # type: ignore[arg-type]
 
 
 def test_three_tests__are_each_others_and_of_the_shipped_scenarios_only() -> None:
@@ -129,8 +130,8 @@ def test_three_tests__are_each_others_and_of_the_shipped_scenarios_only() -> Non
 def test_terminal__shows_both_harms_and_the_honest_cost_with_the_push_if_agents_minimise_it(count: str) -> None:
     mine = compared_by("paper-random", "full_brake,coast,constant:3", 30, count)
     sheet = short_sheet(mine)
-    names = ["collision_rate", "first_impact_harm", "total_harm"]
-    names += ["honest_cost", "pushed_mps"] if count == "honest" else []
+    names = ["collision_rate", "first_impact_harm", "total_harm", "honest_cost"]
+    names += ["pushed_mps"] if count == "honest" else []
     assert sheet.names[1:] == names
     for row, columns in zip(sheet.rows, mine.result.columns.values(), strict=True):
         means = [columns["collided" if name == "collision_rate" else name].mean() for name in names]
@@ -157,7 +158,7 @@ def test_evaluate__writes_the_page_of_its_own_numbers(ethbrake: Command, empty_f
     rows = told_json(ethbrake(*words, "--output", "out", "--report", "--json"))
     text = Page(Path("out/report.html").read_text()).text
     assert "rear_end_mps (m/s)" in text and f"{rows[1]['rear_end_mps']:.2f}" in text
-    assert "coast does " in text and f"{rows[1]['first_impact_harm']:.2f}" in text and "vehicle_1 by full_brake" in text
+    assert "coast costs " in text and f"{rows[1]['honest_cost']:.2f}" in text and "vehicle_1 by full_brake" in text
 
 
 def test_evaluate__by_force_leaves_no_file_of_earlier_results(ethbrake: Command, tmp_path: Path, undrawn: None) -> None:

@@ -77,16 +77,20 @@ def test_planners__in_any_line_keep_what_they_predicted(name: str, changes: dict
 
 
 def test_planners__minimise_the_objective_of_the_scenario_also_in_worlds_of_a_table() -> None:
-    result = eb.evaluate(PAPER.replace(objective="own"), "best_harm:200,full_brake+search,e_v2x_bm", episodes=10)
+    result = eb.evaluate(
+        PAPER.replace(objective="own"), "best_harm:200,full_brake+search,e_v2x_bm", episodes=10, harm_count="first"
+    )
     for agent in ("best_harm:200", "full_brake+search"):
         assert result[agent]["predicted_harm"] == pytest.approx(result[agent]["first_impact_harm_2"], rel=1e-12)
-    of_the_line = eb.evaluate(PAPER, "best_harm", episodes=10)["best_harm"]["first_impact_harm_2"]
+    of_the_line = eb.evaluate(PAPER, "best_harm", episodes=10, harm_count="first")["best_harm"]["first_impact_harm_2"]
     assert result["best_harm:200"]["first_impact_harm_2"].tolist() != of_the_line.tolist()
 
 
 def test_planners__spare_one_vehicle_first_and_then_the_line() -> None:
     first = PAPER.replace(objective="first:vehicle_3,then:total")
-    result = eb.evaluate(first, "best_harm:200,full_brake,full_brake+search,e_v2x_bm,vine-paper", episodes=10)
+    result = eb.evaluate(
+        first, "best_harm:200,full_brake,full_brake+search,e_v2x_bm,vine-paper", episodes=10, harm_count="first"
+    )
     goal = {
         agent: 1000.0 * result[agent]["first_impact_harm_3"] + result[agent]["first_impact_harm"] for agent in result
     }
@@ -101,14 +105,14 @@ def test_planners__in_a_role_in_a_team_and_inside_a_shield() -> None:
     roles = {"vehicle_1": "full_brake", "vehicle_2": "best_harm:50", "vehicle_3": "learner"}
     scripted = eb.evaluate(KEPT.replace(roles=roles), "full_brake", episodes=6, seed=4)["full_brake"]
     alone = eb.evaluate(KEPT, "best_harm:50,full_brake+search+step", episodes=6, seed=4)
-    assert scripted["first_impact_harm"] == pytest.approx(alone["best_harm:50"]["predicted_harm"], abs=1.0)
+    assert scripted["honest_cost"] == pytest.approx(alone["best_harm:50"]["predicted_harm"], abs=1.0)
     pair = eb.evaluate("cooperation-3-pair", "best_harm:50,full_brake", episodes=6, seed=4)
-    assert pair["best_harm:50"]["first_impact_harm"].sum() < pair["full_brake"]["first_impact_harm"].sum()
+    assert pair["best_harm:50"]["honest_cost"].sum() < pair["full_brake"]["honest_cost"].sum()
     assert alone["full_brake+search+step"]["replaced_actions"].shape == (6,)
 
 
 def test_limits__are_regret_and_share_of_the_possible_reduction() -> None:
-    result = eb.evaluate("paper-random", "full_brake,best_harm", episodes=60, measures="limits")
+    result = eb.evaluate("paper-random", "full_brake,best_harm", episodes=60, measures="limits", harm_count="first")
     brake, best = result["full_brake"], result["best_harm"]
     assert brake["regret_first"].tolist() == (brake["first_impact_harm"] - brake["best_known_first"]).tolist()
     assert np.abs(best["regret_first"]).max() < 1e-9 and (best["regret_total"] >= -1e-9).all()
@@ -124,9 +128,9 @@ OUTDATED = "the shipped table of best known harm for paper-random is not used, b
 
 def test_best_harm__searches_under_another_impact_law_and_says_so(other_law: str) -> None:
     with pytest.warns(Unfamiliar, match=f"^best_harm:60: searches every world: {OUTDATED}"):
-        (few,) = eb.evaluate(PAPER, "best_harm:60", episodes=5).columns.values()
+        (few,) = eb.evaluate(PAPER, "best_harm:60", episodes=5, harm_count="first").columns.values()
     with pytest.warns(Unfamiliar):
-        (more,) = eb.evaluate(PAPER, "best_harm:600", episodes=5).columns.values()
+        (more,) = eb.evaluate(PAPER, "best_harm:600", episodes=5, harm_count="first").columns.values()
     assert more["first_impact_harm"].sum() < few["first_impact_harm"].sum()  # of a table both would be the same
 
 

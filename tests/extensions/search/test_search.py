@@ -1,6 +1,6 @@
 """Searches: golden values, an optimum by hand, never worse than what they begin with."""
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -9,10 +9,11 @@ import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import HONEST
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.extensions.search.best_harm import best_harm, search_list, starting_profiles
+from ethbrake_marl.extensions.search import best_harm as searching, pricing
+from ethbrake_marl.extensions.search.best_harm import starting_profiles
 from ethbrake_marl.extensions.search.extremes import KEPT_PROFILES
 from ethbrake_marl.extensions.search.kernels import try_all
-from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, problem_of
+from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles
 from ethbrake_marl.extensions.search.search import (
     compact,
     join_profiles,
@@ -27,6 +28,10 @@ from tests.extensions.proofs.worlds import worlds
 from tests.refused import refused
 
 SCENARIO, GAME = eb.open_game("paper-random")
+
+problem_of = partial(pricing.problem_of, harm_count="first")
+best_harm = partial(searching.best_harm, harm_counts=("first", "total"))
+search_list = partial(searching.search_list, harm_counts=("first", "total"))
 
 # harms in m2/s2, to the last bit: scenario, objective, count, the first six worlds of seed 7
 GOLDEN = [
@@ -90,7 +95,7 @@ def test_search__of_one_vehicle_first_then_the_line_spares_both() -> None:
     for objective in ("vehicle_3", "first:vehicle_3,then:total"):
         problem = problem_of(GAME, sampled(), objective=objective)
         last = problem.follow(search_profiles(problem, [grid(problem)], budget=1000)[0])
-        harm[objective], line[objective] = last.borne_harm()[:, 2], last.harm()
+        harm[objective], line[objective] = last.borne_harm("first")[:, 2], last.harm("first")
     assert not harm["first:vehicle_3,then:total"].any() and not harm["vehicle_3"].any()
     hit = line["vehicle_3"] > 0.0
     assert hit.sum() == 3 and (line["first:vehicle_3,then:total"][hit] < 0.8 * line["vehicle_3"][hit]).all()
@@ -152,7 +157,7 @@ def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_
     scenario, game = eb.open_game("paper-random-obstacle")
     alert = scenario.sample(8, seed=7)
     table, problem = best_harm(game, alert, harm_counts=["honest"], budget=200, threads=1), problem_of(game, alert)
-    constant = eb.evaluate(alert, "e_v2x_bm", scenario=scenario, harm_harm_count="honest")["e_v2x_bm"]["honest_cost"]
+    constant = eb.evaluate(alert, "e_v2x_bm", scenario=scenario, harm_count="honest")["e_v2x_bm"]["honest_cost"]
     assert (table.harm["honest"] <= constant + 1e-9).all() and (table.harm["honest"] < constant - 1.0).any()
     assert problem.values(table.profiles["honest"])["honest"].tolist() == table.harm["honest"].tolist()
     table.save(tmp_path / "honest.npz")
@@ -236,7 +241,7 @@ REFUSED = {
     "budget = 0: must be a whole number": lambda: search_profiles(paper(), [grid(paper())], budget=0),
     "harm_count = 'best': must be 'first', 'total' or 'honest'": lambda: problem_of(GAME, sampled(), harm_count="best"),
     "threads = 0: must be a whole number": lambda: search_profiles(paper(), [grid(paper())], budget=9, threads=0),
-    "counts = ('first', 'first'): must be some of first, total, honest, each once": lambda: best_harm(
+    "harm_counts = ('first', 'first'): must be one or more counts of harm, each once": lambda: best_harm(
         GAME, sampled(), harm_counts=("first", "first")
     ),
     "vehicles [2, 3]: plans are searched for one controlled vehicle": lambda: refine(
