@@ -23,7 +23,7 @@ from ethbrake_marl.errors import EthBrakeError, InvalidInput, MissingExtra
 from ethbrake_marl.evaluation.evaluate import evaluate_teams
 from ethbrake_marl.evaluation.measure_registry import MEASURES
 from ethbrake_marl.motion.layout import BRAKE_RATE, GAP, LATENCY, SPEED
-from ethbrake_marl.worlds.channel import EXTENSIONS
+from ethbrake_marl.worlds.channel import CHANNEL_KEYS
 from ethbrake_marl.worlds.physics import register_physics
 from tests import reach
 from tests.refused import refused
@@ -195,7 +195,7 @@ def test_exact_physics__keeps_everything() -> None:
     team = Team.of({"vehicle_2": make_agent("full_brake")}, "brake")
     assert eb.record_episode(PAPER.sample(1, 7), team, game).gaps_m.size
     register_physics("same", Exact())
-    v2x = {"preset": "nominal", **({"persistence": "periodic"} if "persistence" in EXTENSIONS else {})}
+    v2x = {"preset": "nominal", **({"persistence": "periodic"} if "persistence" in CHANNEL_KEYS else {})}
     eb.parallel_env(PAPER.replace(physics="same", v2x=v2x)).reset(seed=7)
 
 

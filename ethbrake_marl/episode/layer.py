@@ -25,7 +25,7 @@ STATE = "true state"  # also gaps, speeds, capacities and latencies of all vehic
 MODEL = "true model"  # also masses, restitution and scripts: everything that an exact simulation needs
 KNOWLEDGE = (SENSORS, MESSAGES, ESTIMATED, STATE, MODEL)
 UNSTATED = "not stated"
-UNFILTERED = (ESTIMATED, STATE, MODEL)  # only who says so sees the true state; layers filter all other agents
+UNFILTERED = (STATE, MODEL)  # only who says so sees the true state; layers filter all other agents
 
 
 class Layer:

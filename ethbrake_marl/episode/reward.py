@@ -188,7 +188,7 @@ class RewardParams(FileModel):
 
 
 REWARDS = {
-    "shaped": RewardParams(harm=0.05, shaping=0.05),
+    "shaped": RewardParams(harm=0.05, shaping=0.05, shaping_discount=0.99),
     "honest": RewardParams(),
     "harm": RewardParams(harm_count=FIRST_IMPACTS),
     "total-harm": RewardParams(harm_count=ALL_IMPACTS),

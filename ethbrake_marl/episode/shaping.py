@@ -2,7 +2,7 @@
 
 With the discount d, the sum of ``d^t shaping`` over an episode is minus its first potential, whatever the learners do.
 So shaping leaves the optimal policy unchanged (Ng, Harada and Russell 1999) if the learners have the discount d, too. A
-learner of a larger discount is paid for states of large predicted harm; with d = 1 there is none.
+learner with a larger discount is paid for states of large predicted harm.
 """
 
 from __future__ import annotations

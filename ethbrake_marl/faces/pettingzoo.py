@@ -44,7 +44,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     vector; ``episode`` is the ``State`` object.
 
     **Rewards.** Minus 0.05 times the honest cost of the step (``episode.counts``), the same for all vehicles, and for
-    learners a potential whose sum over an episode is a constant of the world (``episode.shaping``). ``info["cost"]`` is
+    learners a potential whose discounted sum is a constant of the world (``episode.shaping``). ``info["cost"]`` is
     the honest cost. Other counts of harm, objectives of single vehicles and other terms: ``reward``.
 
     **Start.** A world is drawn from the scenario at the alert, when Vehicle 1 begins to brake. The first observation

@@ -101,6 +101,17 @@ def program(source: str, **environment: str) -> tuple[int, str, str]:
     return process.returncode, process.stdout, process.stderr
 
 
+def test_a_command__uses_one_core_unless_it_is_told_otherwise() -> None:
+    source = (
+        "import os, sys; os.environ.pop('OMP_NUM_THREADS', None); sys.argv = ['ethbrake', '--version']\n"
+        "from ethbrake_marl.cli.app import main\n"
+        "print('numpy' in sys.modules)\n"  # which reads the variable when it is imported
+        "try: main()\n"
+        "finally: print(os.environ['OMP_NUM_THREADS'])"
+    )
+    assert program(source)[1].split() == ["False", "ethbrake", __version__, "1"]
+
+
 def test_program__exit_status_and_streams_and_a_full_disk_behind_stdout() -> None:
     calling = (
         "import os, runpy, sys; sys.argv = ['ethbrake', {!r}];{} runpy.run_module('ethbrake_marl', run_name='__main__')"

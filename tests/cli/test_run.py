@@ -98,12 +98,12 @@ def test_run__trains_on_the_scenario_of_the_command_or_else_of_the_recipe(
     tiny_recipe: Path,
     tmp_path: Path,
 ) -> None:
-    with tiny_recipe.open("a") as file:
-        file.write("\nscenario: mixture-three-tests\n")
-    answer = ethbrake("run", "--recipe", tiny_recipe, *words, "--episodes", "10", "--output", tmp_path / "run")
+    recipe = tmp_path / "tiny.yaml"
+    recipe.write_text(f"{tiny_recipe.read_text()}\nscenario: mixture-three-tests\n")
+    answer = ethbrake("run", "--recipe", recipe, *words, "--episodes", "10", "--output", tmp_path / "run")
     assert answer.status == 0 and answer.out.startswith(f"Trained on {trained_on} by recipe tiny")
     (row, *_) = json.loads((tmp_path / "run" / "results.json").read_text())
-    assert row["scenario"] == compared_in
+    assert (row["parameters"]["scenario"], row["parameters"]["horizon_s"]) == (compared_in, horizon_s)
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["scenario"]["name"] == trained_on
     members = [entry["scenario"] for entry in config["scenario"].get("mixture", [])] or [config["scenario"]]

@@ -154,19 +154,17 @@ def test_interfaces__agree_on_every_episode(scenario: Scenario, reward: str) -> 
 
 @each_bare
 @pytest.mark.parametrize("action", [-1.0, -0.3, 0.5])
-def test_default_reward__adds_up_to_the_scaled_honest_cost_and_a_constant_of_the_world(
-    name: str, action: float
-) -> None:
-    game, interface, paid, given = open_game(PAPER, reward="honest")[1], BARE[name](PAPER, 1), 0.0, [[action]]
-    state = game.reset(PAPER.sample(4, seed=7).take([3]))
+def test_default_reward__is_the_scaled_honest_cost_and_in_sum_a_constant_of_the_world(name: str, action: float) -> None:
+    game, interface, given = open_game(PAPER, reward="honest")[1], BARE[name](PAPER, 1), [[action]]
+    state, total, factor = game.reset(PAPER.sample(4, seed=7).take([3])), 0.0, 1.0
     interface.reset(options={"listed_world": {"seed": 7, "number": 3}})
-    constant = -potential(game.settings, state)[0]
+    constant = -0.05 * potential(game.settings, state)[0]
     while not state.ended[0]:
-        state, _ = game.step(state, np.array(given))
+        state, step = game.step(state, np.array(given))
         turn = interface.step(np.array(given, np.float32))
-        paid += turn.reward[0]
-    assert turn.ended[0] and constant > 1.0
-    assert paid == pytest.approx(0.05 * (constant - state.harm("honest")[0]), abs=1e-4)
+        total += factor * (turn.reward[0] + 0.05 * step.cost[0])
+        factor *= 0.99
+    assert turn.ended[0] and constant > 0.1 and total == pytest.approx(constant, abs=1e-5)
 
 
 def test_interfaces__agree_behind_the_shield_and_differ_from_the_bare_ones() -> None:

@@ -57,8 +57,9 @@ to `front_64` and `rear_2` to `rear_64` are vehicles farther away. More numbers,
 
 ## Reward
 
-The discount of a training must be at most the reward's `shaping_discount` (DISCOUNT by default;
-[why](../environments.md#rewards)). `r = sum weight x term`; the default is `shaped`:
+The discount of a training must be at most the reward's `shaping_discount`
+([why](../environments.md#rewards)). The reward is `r = sum weight x term`. The default is `shaped`, with
+the discount 0.99:
 
 {rewards}
 

@@ -281,7 +281,7 @@ def test_objective__does_not_warn_where_every_impact_counts_or_an_objective_mean
 
 def test_named_rewards__are_those_of_the_page() -> None:
     assert {
-        "shaped": RewardParams(harm=0.05, shaping=0.05),
+        "shaped": RewardParams(harm=0.05, harm_count="honest", shaping=0.05, shaping_discount=0.99),
         "harm": RewardParams(harm=1.0, harm_count="first"),
         "total-harm": RewardParams(harm=1.0, harm_count="total"),
         "honest": RewardParams(harm=1.0, harm_count="honest"),

@@ -69,7 +69,7 @@ KNOWLEDGE = {  # what an agent says that it knows -> whether it sees the true st
     "not stated": False,
     "own sensors": False,
     "messages": False,
-    "estimated model": True,
+    "estimated model": False,
     "true state": True,
     "true model": True,
 }
