@@ -210,7 +210,7 @@ def test_results__have_no_honest_cost() -> None:
     [
         (
             "shaped",
-            "harm_count honest needs exact impacts, and physics: paper-map has none; choose another reward, such",
+            "harm_count honest needs exact impacts, and physics: paper-map has none; write harm_count first",
         ),
         ("honest", "harm_count honest needs exact impacts"),
         ({"harm": 1.0, "push": 1.0}, "the term push needs exact"),
