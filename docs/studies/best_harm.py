@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agent_names import make_teams, open_game
-from ethbrake_marl.episode.counts import COUNTS, HarmCount
+from ethbrake_marl.episode.counts import COUNTS, IMPACT_COUNTS, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, PhysicsError
@@ -116,7 +116,7 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
         raise InvalidInput(f"scenario {scenario.name!r} has no learner; give vehicles to control: --vehicles vehicle_2")
     alert = scenario.sample(given.episodes, seed=given.seed)
     known = None if given.start is None else BestHarmTable.load(given.start)
-    counts = (given.harm_count,) if given.harm_count else ("first", "total") if known is None else tuple(known.harm)
+    counts = (given.harm_count,) if given.harm_count else IMPACT_COUNTS if known is None else tuple(known.harm)
     teams = [make_teams(given.agents, scenario, harm_count=count) if given.agents else {} for count in counts]
     table = search_list(
         game, alert, chunks=None if given.output is None else parts_beside(given.output), harm_counts=counts,

@@ -156,8 +156,8 @@ def test_interfaces__agree_on_every_episode(scenario: Scenario, reward: str) -> 
 @pytest.mark.parametrize("action", [-1.0, -0.3, 0.5])
 def test_default_reward__is_the_scaled_honest_cost_and_in_sum_a_constant_of_the_world(name: str, action: float) -> None:
     game, interface, given = open_game(PAPER, reward="honest")[1], BARE[name](PAPER, 1), [[action]]
-    state, total, factor = game.reset(PAPER.sample(4, seed=7).take([1])), 0.0, 1.0
-    interface.reset(options={"listed_world": {"seed": 7, "number": 1}})
+    state, total, factor = game.reset(PAPER.sample(6, seed=7).take([5])), 0.0, 1.0
+    interface.reset(options={"listed_world": {"seed": 7, "number": 5}})
     constant = -0.05 * potential(game.settings, state)[0]
     while not state.ended[0]:
         state, step = game.step(state, np.array(given))

@@ -107,7 +107,8 @@ def test_report__beside_vector_rewards_and_the_objective_of_harm() -> None:
             "reward_harm", "reward_each", "reward_jerk",
         }  # fmt: skip
     harm = [
-        played(eb.parallel_env(own, reward=reward, report=["harm"]), 20) for reward in ({"harm": 0, "risk": 1}, "harm")
+        played(eb.parallel_env(own, reward=reward, report=["harm"]), 20)
+        for reward in ({"harm": 0, "risk": 1}, "honest")
     ]
     assert of(harm[0], "harm") == of(harm[1], "harm")
     assert any(len(set(values.values())) > 1 for values in of(harm[0], "harm"))  # each vehicle's own

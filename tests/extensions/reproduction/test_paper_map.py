@@ -53,14 +53,14 @@ def test_impacts__of_one_sample_go_from_the_rear_to_the_front() -> None:
      (0.1, "constant:5", 27.97726529370422)],
 )  # fmt: skip
 def test_game__has_the_figures_of_version_0_5(step_s: float, agent: str, harm: float) -> None:
-    result = eb.evaluate(MAPPED.replace(time_step_s=step_s), agent, episodes=2_000)
+    result = eb.evaluate(MAPPED.replace(time_step_s=step_s), agent, episodes=2_000, harm_count="first")
     assert result[agent]["first_impact_harm"].mean() == harm
 
 
 def test_game__world_does_not_depend_on_the_others_and_its_end_stays() -> None:
     alert = MAPPED.sample(3, 7)
     alert.car[1, LATENCY, 2] = 0.31
-    _, game = eb.open_game(MAPPED)
+    _, game = eb.open_game(MAPPED, reward="harm")
     states = [game.reset(alert), *(game.reset(alert.take([k])) for k in range(3))]
     for step in range(90):
         action = -0.5 + 0.3 * np.sin(step)
@@ -93,7 +93,7 @@ def by_hand(start: eb.State, actions: np.ndarray) -> tuple[list[float], list[flo
 
 
 def test_game__is_that_of_a_slow_reference() -> None:
-    _, game = eb.open_game(MAPPED)
+    _, game = eb.open_game(MAPPED, reward="harm")
     state = start = game.reset(MAPPED.sample(60, 7))
     actions = np.random.default_rng(7).uniform(-1.0, 1.0, (75, 60, 1))
     for each in actions:
@@ -172,17 +172,19 @@ def test_scenario__refuses_what_the_map_has_not(changes, message: str) -> None:
 def test_early_impacts__are_refused() -> None:
     early = MAPPED.replace(gaps_m=0.2, speeds_mps=[18, 22, 22], early_impacts="keep")
     with refused("row 0 has an impact before the first decision, which physics: paper-map does not know"):
-        eb.evaluate(early, "full_brake", episodes=3)
+        eb.evaluate(early, "full_brake", episodes=3, harm_count="first")
 
 
 @pytest.mark.parametrize("agent", ["e_v2x_bm", "ppo+episode", "ppo+step", "best_harm", "universal"])
 def test_agents__that_plan_with_exact_impacts_are_refused(agent: str) -> None:
     with refused("does not cover map, by which world 0 departs from the plain game"):
-        eb.evaluate(MAPPED, agent, episodes=3)
+        eb.evaluate(MAPPED, agent, episodes=3, harm_count="first")
 
 
 def test_agents__that_drive_here() -> None:
-    result = eb.evaluate(MAPPED, "full_brake,e_v2x_bm:pairwise,ppo,ppo+episode:pairwise", episodes=20)
+    result = eb.evaluate(
+        MAPPED, "full_brake,e_v2x_bm:pairwise,ppo,ppo+episode:pairwise", episodes=20, harm_count="first"
+    )
     assert result["ppo"]["total_harm"].mean() < result["full_brake"]["total_harm"].mean()
 
 
@@ -195,11 +197,11 @@ MEASURES = (
 @pytest.mark.parametrize("measure", MEASURES)
 def test_measures__of_exact_impacts_are_refused(measure: str) -> None:
     with refused("does not cover map, by which world 0 departs from the plain game"):
-        eb.evaluate(MAPPED, "full_brake", episodes=3, measures=measure)
+        eb.evaluate(MAPPED, "full_brake", episodes=3, measures=measure, harm_count="first")
 
 
 def test_results__have_no_honest_cost() -> None:
-    columns = eb.evaluate(MAPPED, "full_brake", episodes=5)["full_brake"]
+    columns = eb.evaluate(MAPPED, "full_brake", episodes=5, harm_count="first")["full_brake"]
     assert "total_harm" in columns and not any(name.startswith("honest_cost") for name in columns)
 
 
@@ -208,7 +210,7 @@ def test_results__have_no_honest_cost() -> None:
     [
         (
             "shaped",
-            "harm_count honest needs exact impacts, and physics: paper-map has none; choose another reward, such",
+            "harm_count honest needs exact impacts, and physics: paper-map has none; write harm_count first",
         ),
         ("honest", "harm_count honest needs exact impacts"),
         ({"harm": 1.0, "push": 1.0}, "the term push needs exact"),
@@ -235,11 +237,11 @@ def test_mixture__has_one_physics() -> None:
     with refused("physics must be the same in all scenarios of the mixture"):
         eb.Scenario(name="mixed", mixture=[exact, mapped])
     both = eb.Scenario(name="mixed", physics="paper-map", mixture=[exact, mapped])
-    assert eb.evaluate(both, "full_brake", episodes=10).n == 10
+    assert eb.evaluate(both, "full_brake", episodes=10, harm_count="first").n == 10
 
 
 def test_honest_cost__of_exact_impacts_is_missing() -> None:
-    assert "honest_cost" not in eb.evaluate(MAPPED, "coast", episodes=3)["coast"]
+    assert "honest_cost" not in eb.evaluate(MAPPED, "coast", episodes=3, harm_count="first")["coast"]
     assert "honest_cost" in eb.evaluate(MAPPED.replace(physics=None), "coast", episodes=3)["coast"]
     for refusing in (MAPPED.sample(1, 7).harm, MAPPED.sample(1, 7).pair_harm, MAPPED.sample(1, 7).borne_harm):
         with refused("the honest cost does not cover map"):

@@ -91,7 +91,7 @@ class World:
 )
 def test_second_program__agrees(changes, bias: float) -> None:
     n = 20
-    reward = {"harm": 0.0, **WEIGHTS, **CONSTANTS, "k_energy": list(K_ENERGY)}
+    reward = {"harm": 0.0, "harm_count": "first", **WEIGHTS, **CONSTANTS, "k_energy": list(K_ENERGY)}
     scenario, game = eb.open_game(MAPPED.replace(**changes), reward=reward)
     alert = scenario.sample(n, 7)
     worlds = [World(alert, k, scenario.speed_limit_mps, scenario.time_step_s) for k in range(n)]

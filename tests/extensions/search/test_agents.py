@@ -105,7 +105,7 @@ def test_planners__in_a_role_in_a_team_and_inside_a_shield() -> None:
     roles = {"vehicle_1": "full_brake", "vehicle_2": "best_harm:50", "vehicle_3": "learner"}
     scripted = eb.evaluate(KEPT.replace(roles=roles), "full_brake", episodes=6, seed=4)["full_brake"]
     alone = eb.evaluate(KEPT, "best_harm:50,full_brake+search+step", episodes=6, seed=4)
-    assert scripted["honest_cost"] == pytest.approx(alone["best_harm:50"]["predicted_harm"], abs=1.0)
+    assert scripted["honest_cost"] == pytest.approx(alone["best_harm:50"]["predicted_harm"], abs=8.0)
     pair = eb.evaluate("cooperation-3-pair", "best_harm:50,full_brake", episodes=6, seed=4)
     assert pair["best_harm:50"]["honest_cost"].sum() < pair["full_brake"]["honest_cost"].sum()
     assert alone["full_brake+search+step"]["replaced_actions"].shape == (6,)

@@ -123,7 +123,7 @@ def test_best_harm__of_two_cars_by_hand(bodies: list[int], harm: float) -> None:
 
 def test_best_harm__is_never_worse_than_one_vehicle_alone_or_what_it_is_given_or_e_v2x_bm() -> None:
     scenario, game = eb.open_game("cooperation-3-pair")
-    alert, options = scenario.sample(8, seed=2), {"counts": ["first"], "threads": 1}
+    alert, options = scenario.sample(8, seed=2), {"harm_counts": ["first"], "threads": 1}
     both, alone = (best_harm(game, alert, bodies=bodies, budget=300, **options) for bodies in (None, [2]))
     constant = eb.evaluate(alert, "e_v2x_bm", scenario="paper-random")["e_v2x_bm"]["first_impact_harm"]
     assert (both.harm["first"] <= alone.harm["first"] + 1e-12).all() and [*both.harm] == ["first"]
@@ -167,7 +167,7 @@ def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_
 
 @pytest.mark.parametrize("stepwise", [False, True])
 def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool) -> None:
-    problem, values = paper().with_count("honest"), np.empty(1)
+    problem, values = paper().with_count(HONEST), np.empty(1)
     driving, random = problem.constant(problem.bounds[:, np.newaxis, :, 1]), random_states(problem.identity, 0)
     last = problem.follow(driving)
     assert last.line[:, MOVING].any(axis=1).all()
@@ -229,7 +229,9 @@ def test_search_list__goes_on_where_it_stopped(tmp_path, monkeypatch) -> None:
     assert len([*tmp_path.iterdir()]) == 4
     again = search_list(GAME, sampled(), known_table=table, budget=1).harm["total"]
     assert (again <= table.harm["total"]).all()
-    team = eb.Team("best_harm", {2: eb.make_agent("best_harm", scenario=SCENARIO)})  # drives shipped profiles
+    team = eb.Team(
+        "best_harm", {2: eb.make_agent("best_harm", scenario=SCENARIO, harm_count="first")}
+    )  # drives shipped profiles
     driven = eb.evaluate(sampled(), {"best": team}, scenario=SCENARIO)["best"]["first_impact_harm"]
     better = search_list(GAME, sampled(), teams=[team], budget=1).harm["first"]
     assert (better <= driven).all() and (driven < table.harm["first"] - 0.01).any()
