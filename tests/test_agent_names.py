@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from ethbrake_marl import agent_names
@@ -20,7 +19,7 @@ from ethbrake_marl.agent_names import (
     register_shield,
     teams_of,
 )
-from ethbrake_marl.agents.team import Team, play_to_end
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.worlds.catalogue import load_scenario
 
@@ -69,7 +68,7 @@ def around(team: Team, argument: str | None, settings: AgentSettings) -> Team:
     return team._replace(name=f"around {argument}")
 
 
-@pytest.mark.parametrize("spec", ["full_brake", "coast", "constant:3.5", "constant:-1"])
+@pytest.mark.parametrize("spec", ["full_brake", "constant:-1"])
 def test_a_script__has_the_name_that_it_was_asked_for_by(spec: str):
     assert make_agent(spec).name == spec
 
@@ -79,18 +78,13 @@ def test_a_script__has_the_name_that_it_was_asked_for_by(spec: str):
     [
         ("constnt:3", "unknown agent 'constnt'; did you mean 'constant'"),
         ("constant", "constant needs a finite deceleration"),
-        ("constant:x", "constant needs a finite deceleration"),
         ("full_brake:3", "full_brake takes no argument"),
         ("full_brake@x", "full_brake uses no policy"),
         ("full_brake+stepp", "unknown shield or search 'stepp'"),
         ("x.py:make", "file 'x.py': does not exist"),
         ("", "must be a name"),
-        (3, "must be a name"),
-        (None, "must be a name"),
         ("a@", "a path must follow '@'"),
-        ("a b", "unknown agent 'a b'"),
         ("runs/mine.zip", "agent 'runs/mine.zip': is a file; load it: "),
-        ("A", "unknown agent 'A'"),
     ],
 )
 def test_a_bad_name__is_refused_in_one_line(spec: Any, message: str):
@@ -114,11 +108,9 @@ def test_an_agent_in_a_file__may_have_a_wrapper(file: str):
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("mine.py:other", "does not define 'other'"),
         ("mine.py:number", "is not a function"),
         ("mine.py:fails", "RuntimeError: no"),
         ("mine.py:make:3", "has no parameters"),
-        ("mine.py:make@runs", "has no parameters"),
     ],
 )
 def test_a_bad_agent_in_a_file__is_refused_in_one_line(file: str, spec: str, message: str):
@@ -172,23 +164,9 @@ def test_an_argument__may_be_a_line_of_its_own():
     assert make_agent("coast+around:other", scenario=PAPER).drivers == {}
 
 
-def test_a_function_of_a_file__takes_an_argument_and_wrappers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.chdir(tmp_path)
-    register_shield("around", around)
-    text = "import ethbrake_marl as eb\ndef make(argument, settings):\n    return eb.make_agent('constant:' + argument)"
-    (tmp_path / "mine.py").write_text(text)
-    team = make_agent("mine.py:make:3+around", scenario=PAPER)
-    assert team.name == "mine.py:make:3+around" and team.drivers[2].name == "constant:3"
-
-
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [
-        ("a+b", "{}"),
-        ("a,b", "policy@{}"),
-        ("lr=1,seed=2,x", "policy@{}+around"),
-        ("a+around", "coast,policy@{}/policy,full_brake"),
-    ],
+    [("a+b", "{}"), ("lr=1,seed=2,x", "policy@{}+around"), ("a+around", "coast,policy@{}/policy,full_brake")],
 )
 def test_a_path_with_a_comma_or_plus__is_refused(name: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
@@ -223,12 +201,6 @@ def test_a_group__stands_for_its_agents_and_a_list_has_each_once():
         make_agent("both")
 
 
-def test_a_team__drives_every_learner_with_one_agent():
-    scenario, game = open_game("cooperation-3-pair")
-    team = make_teams(["full_brake"], scenario)["full_brake"]
-    assert np.isfinite(play_to_end(game, scenario.sample(5, 7), team).harm()).all()
-
-
 def test_agents__are_given_as_names_or_as_mappings_of_names_agents_and_vehicles():
     scenario, coast = load_scenario("cooperation-3-pair"), make_agent("coast")
     assert list(teams_of("coast,full_brake", scenario)) == list(teams_of(["coast", "full_brake"], scenario))
@@ -243,10 +215,8 @@ def test_agents__are_given_as_names_or_as_mappings_of_names_agents_and_vehicles(
 @pytest.mark.parametrize(
     ("agents", "message"),
     [
-        ({}, "must be names, such as"),
         ({"a": 3}, "agent 'a' = 3: has no name"),
         ({"a": {"vehicle": "coast"}}, "team 'a': 'vehicle': must be the name of a vehicle"),
-        ({"a": {2: "coast"}}, "team 'a': 2: must be the name of a vehicle"),
         ({"a": {"vehicle_2": Team("x", {})}}, "team 'a': vehicle_2 = Team.*has no knows"),
         (["coast", 3], "must be a name, for instance"),
     ],

@@ -2,7 +2,6 @@
 
 import io
 import os
-import shutil
 import subprocess
 import sys
 from contextlib import redirect_stdout
@@ -126,17 +125,6 @@ def test_names_of_files__differ_in_more_than_case_and_have_no_character_that_win
     assert not [name for name in listed if set('<>:"|?*\\') & {*name} or len(name) > 120]
     parts = {Path(part).stem.lower() for name in listed for part in name.split("/")}
     assert not parts & {"con", "prn", "aux", "nul", "com1", "lpt1"}
-
-
-def test_long_path__holds_results_and_a_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path.joinpath(*["a folder with a long name " + "x" * 40] * 12)
-    folder.mkdir(parents=True)
-    monkeypatch.chdir(folder)
-    Path("mine.yaml").write_text(new_scenario_text("mine"))
-    Path("out").mkdir()
-    table = eb.summarise(result := eb.evaluate(folder / "mine.yaml", "coast", episodes=2))
-    assert [path.is_file() for path in eb.write_results(folder / "out", table, result, rows="csv")] == [True, True]
-    shutil.rmtree(folder / "out")
 
 
 def test_workers__are_started_without_fork(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -175,11 +175,10 @@ def test_torch_module__drives_without_gradients() -> None:
     assert harms(policy_agent(still)) == harms(policy_agent(still))
 
 
-@pytest.mark.parametrize("kind", [torch.float64, torch.float16, torch.bfloat16], ids=str)
-def test_torch_module__of_another_type_drives(kind: torch.dtype) -> None:
+def test_torch_module__of_another_type_drives() -> None:
     net = small_net()
     expected = harms(policy_agent(net))
-    assert harms(policy_agent(net.to(kind))) == pytest.approx(expected, rel=0.2, abs=5.0)
+    assert harms(policy_agent(net.to(torch.bfloat16))) == pytest.approx(expected, rel=0.2, abs=5.0)
 
 
 def test_model__drives_as_in_its_own_librarys_rollout() -> None:
@@ -219,11 +218,10 @@ def test_memory__belongs_to_each_world_and_to_nobody_else() -> None:
     assert (bound.harm("first") <= bound.memories["shield"].first).all() and sum(harms(agent)) > bound.harm().sum()
 
 
-@pytest.mark.parametrize("count", [2, 5])
-def test_indices__stand_for_evenly_spaced_actions(count: int) -> None:
-    for index in range(count):
-        agent = policy_agent(lambda seen, i=index: np.full(len(seen), i), actions=count)
-        assert actions(agent) == pytest.approx([-1.0 + 2.0 * index / (count - 1)] * 12)
+def test_indices__stand_for_evenly_spaced_actions() -> None:
+    for index in range(5):
+        agent = policy_agent(lambda seen, i=index: np.full(len(seen), i), actions=5)
+        assert actions(agent) == pytest.approx([-1.0 + 0.5 * index] * 12)
 
 
 def test_clip__means_the_nearest_action_and_one_float32_step_beyond_is_always_1() -> None:
@@ -254,7 +252,6 @@ def copies(make: Callable[[Any], Any]) -> Any:
 
 AROUND: dict[str, Any] = {
     "rows": lambda features: rows(observation=features),
-    "DummyVecEnv": lambda features: vec_env.DummyVecEnv([lambda: Monitor(EthBrakeEnv(observation=features))]),
     "VecNormalize": lambda features: vec_env.VecNormalize(rows(observation=features)),
     "SuperSuit": lambda features: copies(
         lambda supersuit: EthBrakeParallelEnv(agents="learners", observation=features)
@@ -276,13 +273,12 @@ def test_model__observes_what_it_was_trained_on_even_from_a_file(around: str, tm
         policy_agent(trained, observation=["own"])
 
 
-@pytest.mark.parametrize("given", [brake, small_net()], ids=["function", "torch module"])
-def test_policy_that_says_nothing__is_asked_for_its_features_where_they_are_not_the_usual_ones(given: Any) -> None:
+def test_policy_that_says_nothing__is_asked_for_its_features_where_they_are_not_the_usual_ones() -> None:
     own = open_game("paper-random", observation=OTHERS)
     for scenario, game in (OBSTACLE, own):
         with refused("nothing says which features the policy observes, and vehicle_2 of scenario 'paper-random"):
-            harms(policy_agent(given), game, scenario.sample(3, 7))
-        harms(policy_agent(given, observation=View()), game, scenario.sample(3, 7))
+            harms(policy_agent(brake), game, scenario.sample(3, 7))
+        harms(policy_agent(brake, observation=View()), game, scenario.sample(3, 7))
     agent = policy_agent(brake, scenario=OBSTACLE[0])
     assert agent.observation == OBSTACLE[1].views[2] and "obstacle.gap" in agent.observation.names
     assert harms(agent, OBSTACLE[1], OBSTACLE[0].sample(3, 7))
@@ -316,13 +312,8 @@ class TimeLimit(Negated):
 
 CHANGING: dict[str, Any] = {
     "NormalizeObservation": lambda: wrappers.NormalizeObservation(EthBrakeEnv()),
-    "Negated": lambda: Monitor(wrappers.TimeLimit(Negated(EthBrakeEnv()), 50)),
     "TimeLimit": lambda: TimeLimit(EthBrakeEnv()),
-    "OwnEnv": OwnEnv,
     "VecFrameStack": lambda: vec_env.VecFrameStack(rows(), 1),
-    "FrameStackModifier": lambda: copies(
-        lambda supersuit: supersuit.frame_stack_v1(EthBrakeParallelEnv(agents="learners"), 1)
-    ),
 }
 
 
@@ -409,8 +400,8 @@ class Spaced:
 @pytest.mark.parametrize(
     ("space", "settings"),
     [
-        (Box(0.0, 1.0, (1,)), {}), (Box(-2.0, 2.0, (1,)), {"clip": True}), (Box(-1.0, 1.0, (2,)), {}),
-        (Discrete(3), {}), (Discrete(3), {"actions": 5}), (Discrete(3, start=1), {"actions": 3}),
+        (Box(0.0, 1.0, (1,)), {}), (Box(-2.0, 2.0, (1,)), {"clip": True}), (Discrete(3), {"actions": 5}),
+        (Discrete(3, start=1), {"actions": 3}),
     ],
     ids=str,
 )  # fmt: skip
@@ -431,8 +422,6 @@ def test_discrete_actions_of_our_environments__are_known_from_the_space(tmp_path
 WRONG: dict[str, Any] = {
     "float64 of shape (12, 2); must return a number in [-1, 1]": lambda n: np.zeros((n, 2)),
     "float64 of shape (); must return": lambda n: 0.5,
-    "bool of shape (12,); must return": lambda n: [True] * n,
-    "returned (array([[0.],": lambda n: (np.zeros((n, 1)), None),
 }
 
 
@@ -445,7 +434,6 @@ def test_answer_of_a_wrong_form__is_refused_with_the_vehicle(message: str) -> No
 
 BEYOND: dict[str, Any] = {
     "action 1.5; must be a number in [-1, 1]; clip=True clips": 1.5, "action nan; must be a": np.nan,
-    "action -1e+300; must be": -1e300,
 }  # fmt: skip
 
 
@@ -462,7 +450,7 @@ ANSWERS: dict[str, Any] = {  # what the message says after the vehicle: what the
 }
 
 
-@pytest.mark.parametrize("body", [2, 3])
+@pytest.mark.parametrize("body", [3])
 @pytest.mark.parametrize("message", ANSWERS)
 def test_answer__that_is_refused_names_the_vehicle_whatever_the_others_do(message: str, body: int) -> None:
     scenario, game = open_game(open_game("cooperation-3-pair")[0].replace(latency_s=0.5))
@@ -472,7 +460,7 @@ def test_answer__that_is_refused_names_the_vehicle_whatever_the_others_do(messag
         play_to_end(game, scenario.sample(3, 7, first=5), Team("mine", {2: good, 3: good} | {body: bad}))
 
 
-@pytest.mark.parametrize("body", [2, 3])
+@pytest.mark.parametrize("body", [3])
 def test_answer__of_a_policy_with_a_state_names_the_vehicle(body: int) -> None:
     scenario, game = open_game("cooperation-3-pair")
     bad = policy_agent(lambda seen, state: seen[:, 0], initial_state=lambda n: np.zeros((n, 1)), name="bad")
@@ -480,7 +468,7 @@ def test_answer__of_a_policy_with_a_state_names_the_vehicle(body: int) -> None:
         play_to_end(game, scenario.sample(3, 7), Team("mine", {2: Held("coast"), 3: Held("coast")} | {body: bad}))
 
 
-@pytest.mark.parametrize(("index", "message"), [(5, "action 5"), (-1, "action -1"), (1.0, "float64 of shape (12,)")])
+@pytest.mark.parametrize(("index", "message"), [(-1, "action -1"), (1.0, "float64 of shape (12,)")])
 def test_index__must_be_one_of_the_actions(index: Any, message: str) -> None:
     with refused(f"{message}; must", AgentFailed) as caught:
         harms(policy_agent(lambda seen: np.full(len(seen), index), actions=5, name="mine"))
@@ -509,12 +497,7 @@ REFUSED: dict[str, Any] = {
     ),
     "agent 'brake': actions = 1: must be a whole number, at least 2": lambda: policy_agent(brake, actions=1),
     "agent 'Sequential': initial_state = <function no_steps": lambda: policy_agent(small_net(), initial_state=no_steps),
-    "agent 'ramp': initial_state = 3: must be a function": lambda: policy_agent(ramp, initial_state=3),  # type: ignore[arg-type]
-    "agent 'Sequential': the layer Dropout is in training mode": lambda: policy_agent(
-        torch.nn.Sequential(torch.nn.Linear(27, 1), torch.nn.Dropout(0.5))
-    ),
     "agent 'Layer': the layer GRU is in training mode": lambda: policy_agent(Layer()),
-    "unknown feature 'own.sped'": lambda: policy_agent(brake, observation=["own.sped"]),
     "unknown feature 'learner'": lambda: policy_agent(stable.PPO("MlpPolicy", rows(appended="number"))),
     "the learners of scenario 'two' observe different features; pass observation": lambda: policy_agent(
         brake,
@@ -533,7 +516,7 @@ def test_policy_of_another_library__is_refused(message: str) -> None:
         REFUSED[message]()
 
 
-@pytest.mark.parametrize("memory", [lambda n: np.zeros(n + 1), lambda n: 0.0, lambda n: (np.zeros(n), [object()] * n)])
+@pytest.mark.parametrize("memory", [lambda n: np.zeros(n + 1), lambda n: (np.zeros(n), [object()] * n)])
 def test_memory__has_one_row_for_each_world(memory: Any) -> None:
     right = "must be an array with one row for each of 12 worlds, or a tuple of such arrays"
     with refused(right, AgentFailed):
@@ -558,7 +541,7 @@ def chained(seen: Any) -> Any:
         raise InvalidInput("inner") from error
 
 
-@pytest.mark.parametrize("function", [raising, chained, lambda seen: np.full(len(seen), np.nan), lambda seen: seen])
+@pytest.mark.parametrize("function", [raising, chained])
 def test_failure__names_the_agent_and_has_no_circle(function: Any) -> None:
     with pytest.raises(InvalidInput) as caught:
         harms(policy_agent(function, name="mine"))

@@ -1,6 +1,5 @@
 """The frame of all commands: names, help, completion, streams, signals, exit statuses; and agents from a file."""
 
-import json
 import os
 import re
 import shlex
@@ -50,12 +49,9 @@ FISH = {"_ETHBRAKE_COMPLETE": "complete_fish", "_TYPER_COMPLETE_ARGS": "ethbrake
             {"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake scenario val", "COMP_CWORD": "2"},
             "validate\n",
         ),
-        ({"_ETHBRAKE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --js"}, '"--json"'),
         ({**FISH, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}, "--json"),
         ({**FISH, "_TYPER_COMPLETE_FISH_ACTION": "is-args"}, ""),
-        ({"_ETHBRAKE_COMPLETE": "bash_source"}, None),  # no shell sets these: nothing changes
         ({"_ETHBRAKE_COMPLETE": "1"}, None),
-        ({"_ETHBRAKE_COMPLETE": "complete_bash"}, None),
     ],
 )
 def test_completion__a_shell_that_asks_gets_what_can_follow(monkeypatch, capsys, asked, answered) -> None:
@@ -123,20 +119,6 @@ def test_program__exit_status_and_streams_and_a_full_disk_behind_stdout() -> Non
     assert full == (3, "", "ethbrake: error: output: No space left on device\n")
 
 
-@pytest.mark.parametrize("encoding", [pytest.param("latin-1", marks=pytest.mark.slow), "ascii"])
-def test_program__prints_a_table_on_a_narrow_stdout_and_needs_no_torch(encoding: str) -> None:
-    status, out, err = program(
-        "import sys; from ethbrake_marl.cli.app import main\n"
-        "sys.argv[1:] = ['evaluate', '--episodes', '5', '--agents', 'coast']\n"
-        "try:\n    main()\n"
-        "except SystemExit as end:\n    assert not end.code\n"
-        "print('loaded:', *{'torch', 'stable_baselines3', 'matplotlib'} & set(sys.modules))\n",
-        PYTHONIOENCODING=encoding,
-    )
-    assert status == 0 and "coast" in out, err
-    assert out.endswith("loaded:\n"), out
-
-
 def test_command__ctrl_c_is_one_line_and_the_status_of_an_interruption(capsys) -> None:
     with pytest.raises(typer.Exit) as raised, Out(remains="what was found is kept"):
         raise KeyboardInterrupt
@@ -145,39 +127,6 @@ def test_command__ctrl_c_is_one_line_and_the_status_of_an_interruption(capsys) -
 
 
 # ---------------------------------------------------------------- files and commands of the user's own
-
-
-AGENT = """
-import numpy as np
-import ethbrake_marl as eb
-
-
-class Gentle:
-    name, knows = "gentle", "own sensors"
-
-    def __init__(self, share):
-        self.share = share
-
-    def begin(self, alert, body):
-        return -self.share * alert.braking_capacity_mps2[:, body - 1]
-
-    def act(self, state, memory, body):
-        return memory, memory
-
-
-def make_gentle(argument: str, settings):
-    return Gentle(float(argument or 0.5))
-
-
-assert make_gentle.__annotations__ == {"argument": str}  # a file means what Python says it means
-"""
-
-
-def test_agents_from_a_file__drive_on_the_command_line_behind_a_shield(ethbrake, tmp_path):
-    (tmp_path / "my_agents.py").write_text(AGENT)
-    spec = f"{tmp_path / 'my_agents.py'}:make_gentle:0.3"
-    answer = ethbrake("evaluate", "--episodes", "10", "--agents", f"{spec},{spec}+step", "--json")
-    assert [row["agent"] for row in json.loads(answer.out)] == [spec, f"{spec}+step"]
 
 
 def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatch) -> None:

@@ -33,20 +33,6 @@ def test_tables__show_all_counts_and_say_which_one_agents_minimise(ethbrake: Com
     assert "Honest" in group.out and "stress-wide-obstacle" in group.out
 
 
-def test_a_world_by_hand__in_table_and_rows(tmp_path: Path) -> None:
-    # Vehicle 2 at 10 m/s coasts 5 m in its 0.5 s and brakes the last 3 m with 7 m/s2 towards a standing Vehicle 1:
-    # closing speed squared 10^2 - 2 * 7 * 3 = 58. Vehicle 3 stands 5 km behind. In the second world nobody moves.
-    scenario, own, out = eb.load_scenario("paper-random"), tmp_path / "mine.csv", tmp_path / "worlds.csv"
-    own.write_text("gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps,restitution\n8,5000,0,10,0,0\n8,5000,0,0,0,0\n")
-    found = eb.evaluate(eb.read_worlds(scenario, own), "full_brake", scenario=scenario)
-    (row,) = eb.summarise(found).to_json()
-    told = row["episodes"], row["collision_rate"], row["first_impact_harm"]
-    assert told == (2, 0.5, pytest.approx(29.0, rel=1e-12))
-    eb.write_rows(out, found)
-    hit, still = ([float(each[name]) for name in ("total_harm", "impacts")] for each in rows_of(out))
-    assert hit == [pytest.approx(58.0, rel=1e-12), 1.0] and still == [0.0, 0.0]
-
-
 def test_standards__every_row_names_its_scenario_and_full_braking_passes_as_published(ethbrake: Command) -> None:
     words = ("evaluate", "--scenario", "standards", "--agents", "full_brake,coast", "--episodes", "20", "--json")
     rows = told_json(ethbrake(*words))
@@ -68,29 +54,6 @@ def test_group__has_a_folder_of_results_for_each_scenario(ethbrake: Command) -> 
     check_refused(ethbrake(*words), "already exists")
     assert ethbrake(*words, "--force").status == 0
     assert not Path("new/stress-wide/worlds.csv").exists()
-
-
-TEAM = """
-import ethbrake_marl as eb
-
-
-def make():
-    return eb.Team.of({"vehicle_2": eb.make_agent("coast"), "vehicle_3": eb.make_agent("full_brake")}, "pair")
-"""
-
-
-def test_a_team__goes_behind_the_step_shield_and_no_other(ethbrake: Command) -> None:
-    Path("pair.py").write_text(TEAM)
-    words = ("evaluate", "--scenario", "cooperation-3-pair", "--episodes", "10", "--json", "--agents")
-    alone, shielded = told_json(ethbrake(*words, "pair.py:make,pair.py:make+step"))
-    assert shielded["agent"] == "pair.py:make+step" and shielded["total_harm"] < alone["total_harm"]
-    check_refused(
-        ethbrake(*words, "pair.py:make+episode"), "mode 'episode' needs the policy of exactly one learner, not of 2"
-    )
-    check_refused(
-        ethbrake("evaluate", "--agents", "pair.py:make"),
-        "team 'pair.py:make': drives vehicle_2, vehicle_3; must drive exactly vehicle_2",
-    )
 
 
 @pytest.mark.slow

@@ -82,9 +82,7 @@ def test_run__by_default_trains_what_is_installed() -> None:
 @pytest.mark.parametrize(
     ("words", "trained_on", "compared_in", "horizon_s"),
     [
-        ([], "mixture-three-tests", "paper-random", 8.0),  # as the recipe says
         (["--set", "horizon_s=9"], "mixture-three-tests", "paper-random", 9.0),  # a setting changes nothing else
-        (["--scenario", "paper-random"], "paper-random", "paper-random", 8.0),
         (["--scenario", "paper-random-obstacle"], "paper-random-obstacle", "paper-random-obstacle", 8.0),
     ],
 )

@@ -58,25 +58,14 @@ def test_train__with_a_file_of_ones_own_prints_a_command_that_loads_it_again(
     assert ethbrake(*shlex.split(command)[1:], "--episodes", "3").status == 0
 
 
-@pytest.mark.parametrize("command", ["train", "run"])
-def test_folder_that_exists__is_refused_before_torch_is_loaded(command: str, empty_folder: Path) -> None:
+def test_folder_that_exists__is_refused_before_torch_is_loaded(empty_folder: Path) -> None:
     Path("mine").mkdir()
     program = (
         "import sys; from ethbrake_marl.cli.app import run_command\n"
-        f"print(run_command(['{command}', '--output', 'mine']), 'torch' in sys.modules)"
+        "print(run_command(['run', '--output', 'mine']), 'torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "2 False\n" and "mine: already exists and is not the folder of a run" in done.stderr
-
-
-def test_train__for_another_count_says_so_in_the_recipe_the_table_and_the_command(
-    ethbrake: Command, tiny_recipe: Path, empty_folder: Path
-) -> None:
-    answer = ethbrake("train", "--recipe", tiny_recipe, "--set", "harm_count=total", "--output", "runs/mine")
-    config = json.loads(Path("runs/mine/config.json").read_text())
-    assert config["recipe"]["reward"]["harm_count"] == "total" and config["settings"] == ["harm_count=total"]
-    assert answer.out.splitlines()[-1].endswith("--agents full_brake,policy@runs/mine --set harm_count=total")
-    assert "Honest cost" in answer.out and "total harm " in answer.err
 
 
 def test_train__of_several_learners_leaves_a_team_that_evaluate_takes(
@@ -111,16 +100,6 @@ def test_resume__goes_on_and_says_what_is_next(
         ethbrake("train", "--resume", "stopped"),
         "has finished", "ethbrake evaluate --scenario paper-random --agents full_brake,policy@",
     )  # fmt: skip
-
-
-def test_discount__may_be_below_that_of_the_shaping_but_not_above(
-    ethbrake: Command, tiny_recipe: Path, empty_folder: Path
-) -> None:
-    words = ("--recipe", tiny_recipe, "--steps", "128", "--set", "reward.shaping=0.1", "--set", "gamma=0.9")
-    assert ethbrake("train", *words, "--output", "one").status == 0
-    above = ethbrake("train", *words, "--set", "reward.shaping_discount=0.8", "--output", "both")
-    check_refused(above, "gamma = 0.9: must be at most 0.8, the reward's shaping_discount")
-    assert told_json(ethbrake("train", *words, "--output", "one", "--force", "--json"))["steps"] == 128
 
 
 @pytest.mark.parametrize(

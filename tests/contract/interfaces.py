@@ -60,9 +60,6 @@ REST = eb.Scenario(
     latency_s=[0, 0.5],
 )
 SCENARIOS = {"paper-random": PAPER, "five": FIVE}
-LEVELS = {
-    entry.name: eb.load_scenario(entry.name) for entry in eb.list_scenarios() if entry.path.parent.name == "cooperation"
-}
 
 
 def line(vehicles: int, v2x: str = "congested", horizon_s: int = 12) -> eb.Scenario:

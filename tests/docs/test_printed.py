@@ -58,10 +58,7 @@ def test_reference_values__are_those_of_the_closed_form() -> None:
     [
         ("| a | 1.25 |", "1.2496", []),
         ("| a | 1.25 |", "1.244", ["1.25"]),
-        ("| a | 65.1 % [64.1, 66.0] |", "0.6508 0.641 0.66", []),
-        ("| a | 65.1 |", "0.651", ["65.1"]),
         ("| a | 0.5 %, 12 |", "0.0049 13", []),  # of whole numbers nothing is said
-        ("| a | −3.14 |", "-3.141", []),
     ],
 )
 def test_missing_figures__are_those_that_nothing_rounds_to(table: str, printed: str, missing: list[str]) -> None:
@@ -144,9 +141,7 @@ def test_pythons__are_the_same_wherever_they_stand() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("version", "suits"), [("3, 10, 19", False), ("3, 11", True), ("3, 14, 9", True), ("3, 15", False)]
-)
+@pytest.mark.parametrize(("version", "suits"), [("3, 11", True), ("3, 15", False)])
 def test_make__takes_only_a_python_that_suits(version: str, suits: bool, tmp_path: Path) -> None:
     python = tmp_path / "python"  # this Python under another number; it makes no environment
     program = f'import sys; sys.version_info = ({version}); exec(sys.argv[2] if sys.argv[1] == "-c" else "sys.exit(3)")'

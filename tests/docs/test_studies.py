@@ -96,7 +96,6 @@ def test_lines__are_trained_on_by_their_recipe() -> None:
     ("words", "message"),
     [
         ("lines.py {file}", "lines.py: error: "),
-        ("competence.py warning nix/nix", "competence.py: error: "),
         ("competence.py rule", "competence.py: error: rule needs a policy, such as runs/lines/start"),
     ],
 )

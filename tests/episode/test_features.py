@@ -114,7 +114,7 @@ def test_place_and_obstacle__by_hand() -> None:
     assert seen(struck, 4, view, "obstacle.hit") == {"obstacle.hit": 1.0}
 
 
-@pytest.mark.parametrize(("speed", "fitting"), [(0.0, 0.0), (0.1, 0.5), (0.2, 2.0), (20.0, 2.0)])
+@pytest.mark.parametrize(("speed", "fitting"), [(0.1, 0.5), (20.0, 2.0)])
 def test_fitting_deceleration__without_room_is_that_of_one_millimetre(speed: float, fitting: float) -> None:
     touching = state_of([0.0], [0.0, speed])  # v^2 / (2 * 0.001 m), divided by 10 and cut at 2
     assert seen(touching, 2, View(["front_1.fitting_deceleration"])) == {"front_1.fitting_deceleration": fitting}
@@ -143,15 +143,7 @@ def test_what_is_observed__is_clipped_to_its_bounds() -> None:
     assert (found >= low).all() and (found <= high).all() and (found == high).sum() >= 5
 
 
-@pytest.mark.parametrize(
-    "listed",
-    [
-        ["front_1.gap", "own.speed"],
-        ["rear_1", "own_build_up_time", "front_2.hit"],
-        ["place", "obstacle.gap", "role", "own.mass"],
-        ["front_1.harm_weight", "front_1"],
-    ],
-)
+@pytest.mark.parametrize("listed", [["rear_1", "own_build_up_time", "front_2.hit"], ["front_1.harm_weight", "front_1"]])
 def test_view__of_some_features_has_the_bits_of_the_whole_in_its_own_order(listed: list[str]) -> None:
     view = View(listed)
     groups = View(["own", "front_1", "front_2", "rear_1", "role", "obstacle", "place", "own_build_up_time",

@@ -44,9 +44,7 @@ def test_shares__add_up_to_the_last_bit_and_are_inverse_to_the_masses(mass: list
 @pytest.mark.parametrize(
     ("harm", "mass", "expected"),
     [  # the lighter one of a pair bears more
-        ([16, 0], [1, 3, 1], [12.0, 4.0, 0.0]),
         ([16, 0], [3, 1, 1], [4.0, 12.0, 0.0]),
-        ([0, 16], [1, 3, 1], [0.0, 4.0, 12.0]),
         ([16, 8], [1, 3, 1], [12.0, 6.0, 6.0]),
     ],
 )
@@ -97,21 +95,16 @@ def of_objective(objective: Any, state: State, count: str = "first") -> list[flo
     [  # pair 1 gives 8 and 4, pair 2 gives 3 and 6 of its first: the vehicles bear (8, 7, 6)
         ("total", [21.0, 21.0, 21.0]),
         ("own", [8.0, 7.0, 6.0]),
-        ("social:0", [8.0, 7.0, 6.0]),
-        ("social:90", [13.0, 14.0, 15.0]),
         ("social:45", [21 / 2**0.5] * 3),
         ("social:30", [x * 0.75**0.5 + (21 - x) / 2 for x in (8, 7, 6)]),
         ("maximin", [8.0, 8.0, 8.0]),
         ("preference", [18.75] * 3),  # 3 (7 + 3 x 6) / 4
-        ("weighted:0,1,3", [18.75] * 3),
         ("mass-weighted", [21.0, 21.0, 21.0]),
         ("weighted:1,4,2", [3 * (8 + 4 * 7 + 2 * 6) / 7] * 3),
-        ("weighted:1e6, 1e-6,1e6", [21.0, 21.0, 21.0]),
         (("total", "own", "maximin"), [21.0, 7.0, 8.0]),
         ("vehicle_3", [6.0] * 3),
         ("first:vehicle_3,then:total", [6021.0] * 3),
         ("first:own,then:vehicle_1", [8008.0, 7008.0, 6008.0]),
-        ("first:weighted:0,0,1,then:maximin", [18008.0] * 3),
     ],
     ids=str,
 )
@@ -122,8 +115,8 @@ def test_objective__by_hand(objective: Any, harm: list[float]) -> None:
 @pytest.mark.parametrize(
     "objective",
     [
-        "own", "maximin", "social:30", "weighted:1,4,2", "first:own,then:maximin",
-        "first:maximin,then:own", "first:vehicle_3,then:own",
+        "maximin", "social:30", "first:own,then:maximin",
+        "first:vehicle_3,then:own",
     ],
 )  # fmt: skip
 def test_objective__of_some_time_is_what_it_has_grown_by(objective: str) -> None:
@@ -136,7 +129,7 @@ def test_objective__of_some_time_is_what_it_has_grown_by(objective: str) -> None
 @pytest.mark.parametrize(
     "objective",
     [
-        "total", "own", "social:30", "mass-weighted", "weighted:1,4,2", "preference", "vehicle_2",
+        "total", "social:30", "weighted:1,4,2", "vehicle_2",
         "first:vehicle_3,then:social:30",
     ],
 )  # fmt: skip
@@ -171,7 +164,7 @@ def test_objective__is_the_same_after_a_pickle() -> None:
 
 # ---------------------------------------------------------------- the harm of an episode
 
-OBJECTIVES = ["total", "own", "social:30", "maximin", "mass-weighted", "weighted:1,4,2"]
+OBJECTIVES = ["social:30", "maximin", "mass-weighted"]
 
 
 @pytest.mark.parametrize(

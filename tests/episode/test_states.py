@@ -13,7 +13,6 @@ from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import choose, descend, hold
-from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
@@ -21,11 +20,9 @@ from ethbrake_marl.motion.layout import BRAKING
 
 N = 7
 REWARDS: dict[str, Any] = {
-    "paper-random": "harm",
     "paper-random-obstacle": {"harm": 1.0, "harm_count": "total", "terminal": 1.0},
     "cooperation-3-pair": {"harm": 0.05, "shaping": 0.05, "jerk": 1e-4, "objective": "own"},
     "paper-random-buildup": "paper-reward",
-    "realistic-mixed": "total-harm",
 }
 
 
@@ -119,36 +116,9 @@ def test_bad_action__is_refused_and_changes_nothing(game: Game, bad: float) -> N
     assert bits(state) == before
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
-def test_price__is_the_harm_that_happens_to_the_last_bit(game: Game, count: str) -> None:
-    state = middle(game)
-    plans = np.random.default_rng(0).uniform(-1.0, 1.0, (N, 60, len(game.settings.learners)))
-    expected, now = price(game, state, plans, count), state
-    while not now.ended.all():
-        now, _ = game.step(now, plans[np.arange(N), np.minimum(now.steps, 59)])
-    assert expected.tobytes() == now.harm(count).tobytes()
-
-
-def test_hold__is_the_harm_of_constant_commands() -> None:
-    _, game = open_game("paper-random-obstacle")
-    state = game.reset(game.draw(N, 3, 0))
-    tried = -state.car[:, BRAKING, [2]] * np.array([0.0, 0.5, 1.0])
-    found = hold(state, state.wanted, [2], tried[:, :, np.newaxis], game.settings.horizon_s, "total")
-    for c, share in enumerate((0.0, -0.5, -1.0)):
-        now = state
-        while not now.ended.all():
-            now, _ = game.step(now, np.full((N, 1), share))
-        np.testing.assert_allclose(found[:, :, c], [now.harm("total"), now.harm("first")], rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("name", "count", "states"),  # possible states of each world
-    [
-        ("paper-random", "first", 1),
-        ("paper-random-obstacle", "honest", 5),
-        ("paper-random-buildup", "first", 5),
-        ("cooperation-3-five", "honest", 1),
-    ],
+    [("paper-random-obstacle", "honest", 5), ("cooperation-3-five", "honest", 1)],
 )
 def test_choose__is_the_first_trial_with_the_least_harm(name: str, count: str, states: int) -> None:
     scenario, game = open_game(name)

@@ -36,12 +36,11 @@ def test_record__of_one_impact_by_hand() -> None:
     assert "1 impact, harm 9.00 first-impact, 9.00 total" in repr(record)
 
 
-@pytest.mark.parametrize("scenario", ["paper-random", "paper-random-obstacle", "paper-random-buildup", "stress-wide"])
+@pytest.mark.parametrize("scenario", ["paper-random-obstacle", "paper-random-buildup"])
 def test_record__is_the_episode_of_an_evaluation_and_ends_with_it(scenario: str) -> None:
     loaded, game = open_game(scenario)
     for number in range(4):
-        agent = FULL_BRAKE if scenario == "stress-wide" else GENTLE
-        record, team = recorded(scenario, agent, number), Team("x", {2: agent})
+        record, team = recorded(scenario, GENTLE, number), Team("x", {2: GENTLE})
         last = play_to_end(game, loaded.sample(1, 7, first=number), team)
         assert record.time_s[-1] == last.time_s[0] and record.last.line.tolist() == last.line.tolist()
         assert record.speeds_mps[-1].tolist() == last.speeds_mps[0].tolist()
@@ -83,8 +82,8 @@ def test_record__that_is_refused() -> None:
 
 @pytest.mark.parametrize(
     "agent",
-    ["full_brake", FULL_BRAKE, {"vehicle_2": FULL_BRAKE}, {"vehicle_2": "full_brake"}, Team("x", {2: FULL_BRAKE})],
-    ids=("name", "agent", "vehicles", "names of vehicles", "team"),
+    ["full_brake", FULL_BRAKE, {"vehicle_2": "full_brake"}, Team("x", {2: FULL_BRAKE})],
+    ids=("name", "agent", "vehicles", "team"),
 )
 def test_record__takes_every_description_of_an_agent_and_of_a_world(agent: Any) -> None:
     scenario = open_game("paper-random")[0]

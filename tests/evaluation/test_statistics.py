@@ -167,9 +167,7 @@ def drawn(rng: np.random.Generator, groups: int, spread: float, few: bool) -> tu
     return harm, harm * np.repeat(rng.uniform(0.2, 0.8, groups), sizes), names
 
 
-@pytest.mark.parametrize(
-    ("groups", "spread", "few", "least"), [(3, 1.2, False, 0.90), (10, 0.3, False, 0.91), (66, 0.8, True, 0.91)]
-)
+@pytest.mark.parametrize(("groups", "spread", "few", "least"), [(3, 1.2, False, 0.90), (66, 0.8, True, 0.91)])
 def test_interval__by_few_unequal_recordings_covers_the_truth(
     groups: int, spread: float, few: bool, least: float
 ) -> None:

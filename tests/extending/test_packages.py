@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import ethbrake_marl as eb
@@ -221,18 +220,6 @@ def test_register__is_the_way_of_both_and_refuses_another_of_that_name(install: 
         eb.register_agent("gentle", hills.softer)
     with pytest.raises(AlreadyExists, match="measure 'worst' is registered already"):
         eb.register_measure("worst", hills.worst, unit="km/h")
-
-
-def test_measures__of_a_file_are_told_where_it_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "mine.py").write_text(f"{HILLS}\npart = WORST\n")
-    words = ["evaluate", "--episodes", "5", "--agents", "full_brake", "--json"]
-    measures = f"{tmp_path}/mine.py:worst,{tmp_path}/mine.py:part,pushed_mps"
-    assert run_command([*words, "--set", f"measures={measures}"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
-    assert row["worst"] == row["part"] > 0.0 and row["pushed_mps"] >= 0.0
-    assert row["versions"]["mine.py"].startswith("SHA-256 ")
-    found = eb.evaluate("paper-random", "full_brake", episodes=5, measures=[f"{tmp_path}/mine.py:worst"])
-    assert np.mean(found["full_brake"]["worst"]) == row["worst"]
 
 
 OWN = '''

@@ -1,13 +1,10 @@
 """The libraries find and accept the environments: their ids, their own checks, their wrappers."""
 
 import copy
-import gc
-import json
 import pickle
 import warnings
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -35,8 +32,6 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, see
 from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
 from ethbrake_marl.episode.observe import View
-from ethbrake_marl.episode.reward import RewardParams
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
 from ethbrake_marl.faces.registration import register_environments
@@ -96,16 +91,11 @@ CONTENT = load_scenario("paper-random").declared()
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "scenario": {"scenario": load_scenario("paper-random-obstacle")},
     "mixture": {"scenario": load_scenario("mixture-three-tests")},
-    "table": {"scenario": load_scenario("standards-ccrs")},
-    "path": {"scenario": Path("mine.yaml")},
     "content": {"scenario": {**CONTENT, "mass_t": np.array([1.0, 2.0, 3.0]), "gaps_m": {"choice": (7, np.float32(8))}}},
     "reward": {"reward": {"harm": np.float32(0.3), "jerk": np.float64(1e-5), "objective": ("own", "own", "own")}},
-    "params": {"reward": RewardParams(harm=0.5, collision=0.1, k_energy=(1.0, 2.0))},
     "names": {"reward": np.str_("paper-reward"), "learners": np.array(["vehicle_3"])},
     "view": {"observation": {"vehicle_2": View(["own", "rear_1.gap"])}, "learners": ("vehicle_2",)},
-    "features": {"observation": ("own", "front_1")},
     "set": {"learners": {"vehicle_2"}, "render_mode": np.str_("ansi")},
-    "keys": {"learners": {"vehicle_3": 1}.keys()},
     "numbers": {"actions": np.int64(9), "reward_vector": ("harm_1", "harm_2")},
 }
 
@@ -124,8 +114,7 @@ def played(env: Any, n: int | None = None) -> list[Any]:
 
 @pytest.mark.filterwarnings("ignore:.*The reward returned by.*:UserWarning")  # vectors, as MO-Gymnasium has them
 @pytest.mark.parametrize("given", ARGUMENTS.values(), ids=ARGUMENTS)
-def test_spec__every_argument_goes_through_json_and_makes_the_same_episode(given: Any, empty_folder: Path) -> None:
-    empty_folder.joinpath("mine.yaml").write_text(json.dumps({**CONTENT, "name": "mine", "horizon_s": 5.0}))
+def test_spec__every_argument_goes_through_json_and_makes_the_same_episode(given: Any) -> None:
     single = gymnasium.make("EthBrake-v3", **given)
     many = gymnasium.make_vec("EthBrake-v3", 2, autoreset_mode=AutoresetMode.SAME_STEP, **given)
     same = gymnasium.make(EnvSpec.from_json(single.spec.to_json()))
@@ -144,9 +133,8 @@ LATER = {
 
 @pytest.mark.parametrize(
     ("scenario", "learner", "steps", "least"),
-    [("paper-random", "vehicle_2", 75, 75), ("paper-random", "vehicle_3", 72, 72),
-     ("mixture-delays", "vehicle_2", 79, 77), (LATER, "vehicle_2", 75, 60),
-     ("paper-random-obstacle", "vehicle_1", 80, 80)],
+    [("paper-random", "vehicle_2", 75, 75), ("mixture-delays", "vehicle_2", 79, 77), (LATER, "vehicle_2", 75, 60),
+     ],
 )  # fmt: skip
 def test_spec__states_the_longest_episode_in_steps(scenario: Any, learner: str, steps: int, least: int) -> None:
     env = gymnasium.make("EthBrake-v3", scenario=scenario, learners=[learner])
@@ -253,21 +241,6 @@ def test_supersuit__a_seed_repeats_the_numbers_of_skipped_frames() -> None:
         env.reset(seed=seed)
         drawn.append(env.np_random.random())
     assert drawn[1] == drawn[4] and len({*drawn}) == 4
-
-
-REFUSED: list[Callable[[], Any]] = [
-    lambda: EthBrakeVectorEnv(4, scenario="nope"), lambda: EthBrakeVectorEnv(0),
-    lambda: EthBrakeVectorEnv(2, render_mode="human"), lambda: EthBrakeVectorEnv(2, actions=1),
-    lambda: EthBrakeEnv("nope"), lambda: EthBrakeParallelEnv("nope"), lambda: raw_env("nope"),
-    lambda: gymnasium.make_vec("EthBrake-v3", 2, scenario="nope"), lambda: make_sb3_vec_env("nope", 2),
-]  # fmt: skip
-
-
-def test_close__of_what_was_never_opened_does_nothing() -> None:
-    for make in REFUSED:
-        with pytest.raises(InvalidInput):
-            make()
-    gc.collect()  # an error in __del__ would be a warning, and so a failure
 
 
 @pytest.mark.parametrize("kind", [EthBrakeEnv, EthBrakeParallelEnv, EthBrakeVectorEnv, EthBrakeVecEnv])

@@ -128,8 +128,9 @@ def test_infos__name_the_worlds_that_options_specify() -> None:
     assert not dones.all() and [[info[name] for name in NAMES] for info in infos] == [[9, 4, True], [9, 5, True]]
 
 
-@pytest.mark.parametrize("scenario", ["mixture-delays", "cooperation-2-five"])
-@pytest.mark.parametrize("seeds", [[3, 11, 3], (0, 2**62, 5), np.array([8, 8, 1])], ids=str)
+@pytest.mark.parametrize(
+    ("scenario", "seeds"), [("mixture-delays", [3, 11, 3]), ("cooperation-2-five", np.array([0, 2**62, 5]))]
+)
 def test_seeds__one_for_each_row_give_the_episodes_of_single_environments(scenario: str, seeds: Any) -> None:
     many, singles = EthBrakeVectorEnv(3, scenario, autoreset_mode="SameStep"), [EthBrakeEnv(scenario) for _ in range(3)]
     observations, infos = many.reset(seed=seeds)
@@ -150,10 +151,7 @@ def test_seeds__one_for_each_row_give_the_episodes_of_single_environments(scenar
     assert min(infos["world"]) > 0
 
 
-@pytest.mark.parametrize(
-    ("seeds", "kind"),
-    [([2**63 + 1, 3], "uint64"), ([3, 2**64 - 1], "uint64"), ([2**53 + 1, 0], "int64"), ([2**64 + 1, 3], "object")],
-)
+@pytest.mark.parametrize(("seeds", "kind"), [([2**63 + 1, 3], "uint64"), ([2**64 + 1, 3], "object")])
 def test_seeds__of_a_list_keep_all_digits(seeds: list[int], kind: str) -> None:
     env = EthBrakeVectorEnv(2)
     infos = env.reset(seed=seeds)[1]
@@ -163,24 +161,6 @@ def test_seeds__of_a_list_keep_all_digits(seeds: list[int], kind: str) -> None:
     assert env.reset(seed=seeds, options=options)[1]["world_seed"].tolist() == [-1, -1]
     listed = env.reset(seed=seeds, options={"listed_world": {"seed": 2**63 + 5, "number": 0}})[1]
     assert listed["world_seed"].tolist() == [2**63 + 5] * 2
-
-
-def test_seed__above_63_bits_is_exact_beside_worlds_of_options() -> None:
-    env, over = EthBrakeVectorEnv(2, autoreset_mode="SameStep"), np.zeros(2, bool)
-    state = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
-    env.reset(seed=2**63 + 1, options={"initial_state": state})
-    while not over.any():
-        *_, ended, cut, infos = env.step(np.array([[-1.0], [1.0]]))
-        over = ended | cut
-    assert infos["world_seed"].tolist() == [2**63 + 1 if ended else -1 for ended in over]
-
-
-def test_seeds__one_for_each_row_begin_with_the_first_world() -> None:
-    again = EthBrakeVectorEnv(3, "mixture-delays")
-    again.reset(seed=1)
-    assert again.reset(seed=[3, 11, 3])[1]["world"].tolist() == [0, 0, 0]
-    assert again.reset()[1]["world"].tolist() == [1, 1, 1]
-    assert again.reset(seed=4)[1]["world"].tolist() == [0, 1, 2]
 
 
 def test_seeds__none_in_a_list_is_drawn_and_bad_lists_are_refused() -> None:

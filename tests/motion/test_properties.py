@@ -41,7 +41,7 @@ def same_bits(one: Floats, other: Floats) -> None:
 
 
 @pytest.mark.parametrize("obstacle", [False, True])
-@pytest.mark.parametrize("N", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("N", [2, 4])
 def test_motion__is_that_of_small_steps_where_brakes_build_up(N: int, obstacle: bool) -> None:
     runs = random_runs(np.random.default_rng([2, N, obstacle]), 12, N, builds_up=True, obstacle=obstacle)
     end = played(runs)
@@ -53,7 +53,7 @@ def test_motion__is_that_of_small_steps_where_brakes_build_up(N: int, obstacle: 
 
 
 @pytest.mark.parametrize("obstacle", [False, True])
-@pytest.mark.parametrize("N", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("N", [2, 3, 6])
 def test_motion__is_that_of_rational_numbers_where_brakes_act_at_once(N: int, obstacle: bool) -> None:
     runs = random_runs(np.random.default_rng([1, N, obstacle]), 12, N, builds_up=False, obstacle=obstacle)
     end = played(runs)
@@ -66,7 +66,7 @@ def test_motion__is_that_of_rational_numbers_where_brakes_act_at_once(N: int, ob
 
 
 @pytest.mark.parametrize("obstacle", [False, True])
-@pytest.mark.parametrize("N", [2, 3, 4, *(pytest.param(N, marks=pytest.mark.slow) for N in (5, 6))])
+@pytest.mark.parametrize("N", [2, 3, *(pytest.param(N, marks=pytest.mark.slow) for N in (4, 6))])
 def test_push__is_that_of_small_steps_where_brakes_build_up(N: int, obstacle: bool) -> None:
     runs = random_runs(np.random.default_rng([4, N, obstacle]), 12, N, builds_up=True, obstacle=obstacle)
     off, same = pushes_off(runs, 1e-6)

@@ -61,12 +61,6 @@ def test_bundle__is_read_as_it_was_written_and_always_has_the_same_bytes(policy:
     assert np.array_equal(other(observations(5)), policy(observations(5)))
 
 
-def test_home_folder__is_expanded(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    policy.save(tmp_path / "mine")
-    assert load_policy("~/mine").manifest == policy.manifest
-
-
 def test_existing_folder__is_replaced_only_on_request(policy: Policy, tmp_path: Path) -> None:
     policy.save(tmp_path / "a")
     other = make_policy(seed=5)
@@ -177,29 +171,19 @@ def other_digit(name: str) -> Spoil:
 
 SPOILED: dict[str, tuple[Spoil, str]] = {
     "no_manifest": (lambda f: (f / "manifest.json").unlink(), "manifest.json: is missing from the policy bundle"),
-    "no_weights": (lambda f: (f / "weights.safetensors").unlink(), "weights.safetensors: is missing from the policy"),
     "extra_file": (lambda f: (f / "policy.pkl").write_bytes(pickle.dumps(Payload())), "policy.pkl: does not belong"),
     "manifest_link": (instead("manifest.json", link), "manifest.json: is a symbolic link"),
-    "weights_link": (instead("weights.safetensors", link), "weights.safetensors: is a symbolic link"),
     "pipe": (instead("manifest.json", os.mkfifo), "manifest.json: is a device, a pipe or a socket"),
-    "folder": (instead("weights.safetensors", os.mkdir), "weights.safetensors: is a folder"),
     "large": (manifest(lambda data: data + b" " * (1 << 20)), "manifest.json: is larger than 1 MiB"),
-    "not_json": (manifest(lambda _: b"\x80\x04pickle"), "manifest.json: "),
     "key_twice": (
         manifest(lambda data: data.replace(b"{", b'{"algorithm": "ppo",', 1)),
         "manifest.json: a JSON object contains the key 'algorithm' twice",
     ),
     "unknown_key": (edit(loader="os.system"), "manifest.json: loader: is an unknown key"),
     "dotted_algorithm": (edit(algorithm="subprocess.Popen"), "manifest.json: algorithm: must be 1 to 64 lower case"),
-    "another_format": (edit(format="zip"), "manifest.json: format: must be ethbrake-policy"),
     "future_version": (edit(format_version=6), "manifest.json: format_version: must be 2"),
     "wrong_type": (edit(steps="many"), "manifest.json: steps: must be a whole number"),
     "giant_layer": (edit(network__policy_hidden=[10**9]), "manifest.json: network.policy_hidden.0"),
-    "unknown_activation": (edit(network__activation="gelu"), "manifest.json: network.activation: must be"),
-    "mixture_of_experts": (
-        edit(format_version=3, network__networks=2, network__gate_hidden=[4], network__value_hidden=[]),
-        "manifest.json: format_version: must be 2",
-    ),
     "more_features": (
         edit(observation__features=["own.speed"]),
         "manifest.json: observation.features: has 1 features; must have 27, the observation_size",
@@ -220,17 +204,13 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
         "manifest.json: scenario: time_step_s = None: must be a number of seconds above 0, because the policy observes",
     ),
     "path_as_learner": (edit(learners=["../../vehicle_2"]), "manifest.json: learners.0: must match"),
-    "no_learner": (edit(learners=[]), "manifest.json: learners: must not be empty"),
     "other_steps": (edit(rehash=False, steps=999_999_999), "manifest.json: the content has SHA-256"),
     "weights_hash": (other_digit("weights_sha256"), "weights.safetensors: the file has SHA-256"),
-    "own_hash": (other_digit("manifest_sha256"), "manifest.json: the content has SHA-256"),
-    "no_hash": (edit(rehash=False, manifest_sha256="none"), "manifest.json: manifest_sha256: must match"),
     "bit_flip": (
         change("weights.safetensors", lambda d: d[:-3] + bytes([d[-3] ^ 1]) + d[-2:]),
         "weights.safetensors: the file has SHA-256",
     ),
     "pickle": (weights(lambda _: pickle.dumps(Payload())), "weights.safetensors: not a safetensors file"),
-    "cut_short": (weights(lambda data: data[:-5]), "weights.safetensors: not a safetensors file"),
     "extra_tensor": (
         tensors(lambda t: {**t, "policy.9.bias": np.zeros(3, "f4")}),
         "tensor 'policy.9.bias': must not be in this file",
@@ -238,10 +218,6 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "wrong_shape": (
         tensors(lambda t: {**t, "policy.0.bias": np.zeros(14, "f4")}),
         "tensor 'policy.0.bias' has type float32 and shape [14]; must have type float32 and shape [13]",
-    ),
-    "wrong_dtype": (
-        tensors(lambda t: {**t, "policy.0.bias": np.zeros(13, "f8")}),
-        "tensor 'policy.0.bias' has type float64 and shape [13]; must have type float32",
     ),
     "nan_weight": (
         tensors(lambda t: {**t, "value.0.bias": np.append(t["value.0.bias"][1:], np.float32(np.nan))}),
@@ -287,8 +263,6 @@ FOLDERS: dict[str, Callable[[], Any]] = {
     "/dev/zero: is not a folder; give the folder of a policy bundle": lambda: load_policy("/dev/zero"),
     "nowhere: is not a folder": lambda: load_drivers(Path("nowhere")),
     "empty: contains no policy; give the folder": lambda: load_policy("empty"),
-    "policy = None: must be the path of a training run or of a policy bundle": lambda: load_policy(None),  # type: ignore[arg-type]
-    "a\\x00b: is not a folder": lambda: load_policy("a\0b"),
     "unknown shipped policy 'universel'; did you mean 'universal'?": lambda: load_shipped("universel"),
 }
 
@@ -302,13 +276,9 @@ def test_folder_without_a_policy__is_refused(message: str, empty_folder: Path) -
 
 MADE: dict[str, Callable[[Policy], Any]] = {
     "policy: steps: must be greater than or equal to 0": lambda policy: make_policy(steps=-1),
-    "policy: algorithm: must be": lambda policy: make_policy(algorithm="a.b"),
     "policy: seed: is an unknown key": lambda policy: make_with(seed=1),
     "policy: tensor 'policy.0.bias': contains a number": lambda policy: make_with(
         {**policy.tensors, "policy.0.bias": np.full(13, np.nan, np.float32)}
-    ),
-    "policy: tensor 'policy.0.bias': is missing": lambda policy: make_with(
-        {name: each for name, each in policy.tensors.items() if name != "policy.0.bias"}
     ),
     "policy: observation.features: has 27 features; must have 26": lambda policy: make_with(
         spec=network("clip", observation_size=26)

@@ -59,16 +59,11 @@ def test_policy__keeps_its_range_in_its_file(tmp_path: Path, monkeypatch: pytest
     [
         ({"low": (0.0,), "high": (1.0,)}, "training_range: has 1 features; must have"),
         ({"low": (0.0, 1.0), "high": (1.0,)}, "training_range: low, high: must have one number for each feature, low"),
-        (
-            {"low": (2.0,), "high": (1.0,)},
-            "training_range: low, high: must have one number for each feature, low at mo",
-        ),
         ({"low": (0.0,), "high": (1.0,), "fallback": "plan.actoin"}, "unknown feature 'plan.actoin'"),
         (
             {"low": (0.0,), "high": (1.0,), "fallback": "front_1.gap"},
             "training_range: fallback = front_1.gap: must be an action: a feature of unit 1 and scale 1",
         ),
-        ({"low": (0.0,), "high": (1.0,), "fallback": "own.restitution"}, "= own.restitution: must be an action"),
     ],
 )
 def test_bad_range__is_refused(change: dict[str, Any], text: str, tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """One wrapper for all interfaces: the bound holds in each, the caller's environment stays, infos are flat, refusals."""
 
-import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +12,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import make_teams, register_shield
-from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.counts import ALL_IMPACTS, FIRST_IMPACTS, HONEST
@@ -39,11 +37,10 @@ INFOS = {
     "margin": float,
 }
 COAST = Held("coast")
-SCRIPTED = load_scenario("paper-random").replace(roles={f"vehicle_{i}": "coast" for i in (1, 2, 3)})
-CELLS = [  # each interface in a few lines, each line through a few interfaces
+CELLS = [  # each interface in two lines; `test_step` draws from all lines
     (play, name)
     for k, play in enumerate(PLAYS)
-    for name in list(LINES)[k % 4 :: 4]
+    for name in list(LINES)[k % 4 :: 4][:2]
     if not (play in ONLY_ONE and name in TEAMS)
 ]
 
@@ -71,13 +68,10 @@ def test_infos_are_flat_numbers_from_the_reset_on() -> None:
 
 MAKERS: dict[str, Callable[[], Any]] = {
     "parallel": lambda: EthBrakeParallelEnv("paper-random", agents="learners"),
-    "AEC": lambda: raw_env("paper-random", agents="learners"),
-    "Gymnasium": lambda: EthBrakeEnv("paper-random"),
     "in wrappers": lambda: gymnasium.wrappers.OrderEnforcing(
         gymnasium.wrappers.ClipAction(EthBrakeEnv("paper-random"))
     ),
     "vector": lambda: EthBrakeVectorEnv(2, "paper-random"),
-    "vector in a wrapper": lambda: gymnasium.wrappers.vector.RecordEpisodeStatistics(EthBrakeVectorEnv(2)),
     "VecEnv": lambda: make_sb3_vec_env("paper-random", 2, 5),
 }
 
@@ -136,13 +130,12 @@ def test_policies_propose_what_the_caller_leaves_out() -> None:
     assert info["world_first_impact_harm"] == first
 
 
-@pytest.mark.parametrize("policy", [None, "ppo"])
-def test_the_bound_holds_where_the_next_step_begins_the_next_episode(policy: Any) -> None:
+def test_the_bound_holds_where_the_next_step_begins_the_next_episode() -> None:
     """Gymnasium's default: the step after an episode's last one reports the bound of the next one."""
-    env = shield(EthBrakeVectorEnv(8, "paper-random", reward="harm"), policy)
+    env = shield(EthBrakeVectorEnv(8, "paper-random", reward="harm"))
     first, over, episodes = env.reset(seed=1)[1]["shield_bound_harm"].copy(), np.zeros(8, bool), 0
     for _ in range(120):
-        *_, ended, cut, infos = env.step(np.full((8, 1), 1.0 if policy is None else np.nan))
+        *_, ended, cut, infos = env.step(np.ones((8, 1)))
         assert (infos["shield_reason"][over] == ShieldReason.NO_DECISION).all()
         first[over], over = infos["shield_bound_harm"][over], ended | cut
         assert (infos["world_first_impact_harm"][over] <= first[over]).all()
@@ -190,10 +183,9 @@ def test_a_shield_that_is_registered_for_names_is_a_mode() -> None:
         shield(COAST, scenario="paper-random", mode="bare")
 
 
-@pytest.mark.parametrize("named", [{}, {"scenario": "paper-random"}], ids=str)
-def test_a_network__is_refused_with_the_name_of_the_function_that_makes_it_an_agent(named: dict[str, str]) -> None:
+def test_a_network__is_refused_with_the_name_of_the_function_that_makes_it_an_agent() -> None:
     with pytest.raises(InvalidInput, match=r"must be a team, .* make an agent of .* eb.shield\(eb.policy_agent\("):
-        shield(lambda seen: seen[:, :1], **named)
+        shield(lambda seen: seen[:, :1])
 
 
 def test_the_term_intervention() -> None:
@@ -226,18 +218,9 @@ def test_the_measure_intervention__counts_each_replaced_action_and_is_0_without_
     }  # fmt: skip
 
 
-def test_the_copy_can_be_pickled() -> None:
-    env = shield(EthBrakeParallelEnv("paper-random"), LearnedAgent(load_shipped("ppo")))
-    env.reset(seed=7)
-    again = pickle.loads(pickle.dumps(env))
-    assert again.step({})[4] == env.step({})[4]
-
-
 REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: shield(4), InvalidInput, "4: must be a team, an agent, or an environment"),
-    (lambda: shield(EthBrakeEnv), InvalidInput, "must be a team, an agent, or an environment"),
     (lambda: shield(DummyVecEnv([EthBrakeEnv])), InvalidInput, "must be a team, an agent, or an environment"),
-    (lambda: shield(gymnasium.make("CartPole-v1")), InvalidInput, "must be a team, an agent, or an environment"),
     (lambda: shield(VecNormalize(make_sb3_vec_env("paper-random", 1))), InvalidInput, "VecNormalize\\(eb.shield\\(env"),
     (lambda: shield(shield(EthBrakeEnv())), InvalidInput, "this environment already has a shield"),
     (lambda: shield(shield(Team("t", {2: COAST}))), InvalidInput, "team 't\\+step' already has a shield"),
@@ -247,22 +230,13 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: shield(EthBrakeEnv(), scenario="paper-random"), InvalidInput, "EthBrakeEnv.*: leave out scenario"),
     (lambda: shield(EthBrakeEnv(), "coast+step"), InvalidInput, "policy 'coast\\+step' has a shield of its own"),
     (lambda: shield(EthBrakeEnv(), mode="stp"), UnknownName, "unknown shield or search 'stp'; did you mean 'step'"),
-    (lambda: shield(EthBrakeEnv(), mode=None), UnknownName, "unknown shield or search 'None'"),  # type: ignore[arg-type]
-    (lambda: shield(EthBrakeEnv(), mode="step:3"), InvalidInput, "step takes no argument"),
     (lambda: make_teams("coast+step+step", load_scenario("paper-random")), InvalidInput, "already has a shield"),
     (lambda: shield(EthBrakeEnv(), alowance=1), InvalidInput, "'alowance'; its options: harm_count, allowance, cap"),
-    (lambda: shield(EthBrakeEnv(), "coast", "episode", allowance=1), InvalidInput, "'allowance'; its options"),
-    (lambda: shield(EthBrakeEnv(), mode="episode"), InvalidInput, "needs the policy of exactly one learner"),
-    (lambda: shield(EthBrakeEnv(), 4), InvalidInput, "4: .*must be an agent"),
-    (lambda: shield(EthBrakeEnv(), "cost"), UnknownName, "'cost'"),
     (
         lambda: shield(EthBrakeEnv(), {"vehicle_3": COAST}),
         InvalidInput,
         "drives vehicle_3; must drive exactly vehicle_2",
     ),
-    (lambda: shield(EthBrakeEnv(), {2: COAST}), InvalidInput, "2: must be the name of a vehicle"),
-    (lambda: shield(EthBrakeEnv(), allowance=-1), InvalidInput, "allowance = -1"),
-    (lambda: shield(EthBrakeParallelEnv(SCRIPTED)), InvalidInput, "has no learner; pass learners"),
 ]
 
 

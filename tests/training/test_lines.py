@@ -55,11 +55,8 @@ def test_mixture_of_lines__has_the_vehicles_of_the_longest_and_the_learners_of_a
     "use",
     [
         lambda: LINES.sample(2, 7),
-        lambda: LINES.draw(2, 7),
-        lambda: LINES.bounds("mass_t"),
         lambda: LINES.with_learners(["vehicle_2"]),
         lambda: eb.parallel_env(LINES),
-        lambda: eb.make_sb3_vec_env(LINES, 2),
         lambda: eb.evaluate(LINES, "full_brake", episodes=2),
     ],
 )

@@ -159,15 +159,11 @@ def test_run__that_fails_is_a_row_with_its_reason(recipe: str, run: Run, tmp_pat
     [
         ((*RUN, "ppp"), "'ppo'"),
         ((*RUN, "ppo", "ppo"), "only once"),
-        ((*RUN, "ppo", "--decisions", "0"), "--decisions 0: must be 1 or more"),
         ((*RUN, "ppo", "--set", "gama=1"), "gamma"),
-        ((*RUN, "ppo", "--jobs", "0"), "--jobs 0: must be 1 or more"),
         ((*TUNE, "ppo", "--jobs", "0"), "--jobs and --trials must be 1 or more"),
         ((*TUNE, "ppo", "--search", "gamma=0.9..1", "gamma=0.5/0.6"), "each key only once"),
         ((*TUNE, "ppo", "--search", "gamma=0.9"), "KEY=LOW..HIGH"),
-        ((*TUNE, "ppo", "--search", "gamma=3..1"), "low <= high"),
         ((*TUNE, "ppo", "--search", "n_epochs=0..4"), "n_epochs"),
-        ((*TUNE, "ppo", "--search", "mass_t=1..4"), "mass_t"),
     ],
 )
 def test_bad_input__is_refused_in_one_line_and_nothing_is_made(

@@ -60,11 +60,8 @@ REFUSED: dict[str, Callable[[], object]] = {
     "mine.yaml, line 2: algorithm = trpo: must be one of ppo, sac": lambda: with_line(
         "algorithm: ppo", "algorithm: trpo"
     ),
-    "mine.yaml, line 15: network.policy = []: must not be empty": lambda: with_line("policy: [8]", "policy: []"),
-    "mine.yaml, line 15: network.values: unknown key; did you mean value?": lambda: with_line("value:", "values:"),
     "mine.yaml, line 16: reward.harms: unknown key; did you mean harm?": lambda: with_line("harm: 1", "harms: 1"),
     "all weights of the reward except shaping are 0": lambda: with_line("m: 1", "m: 0, shaping: 0.1"),
-    "mine.yaml: must be a mapping of keys to values": lambda: with_line(GOOD, "- ppo\n"),
     "mine.yaml: gamma: missing; this key is required; the shipped recipe ppo has all": lambda: with_line(
         "gamma: 0.99\n", ""
     ),
@@ -72,17 +69,12 @@ REFUSED: dict[str, Callable[[], object]] = {
     "mine.yaml, line 9: gamma = 0.99: must be at most 0.9, the reward's shaping_discount: a larger": lambda: with_line(
         "harm: 1", "harm: 1, shaping: 0.1, shaping_discount: 0.9"
     ),
-    "mine.yaml, line 9: gamma = .nan: must be a finite number": lambda: with_line("0.99", ".nan"),
     "mine.yaml, line 6: batch_size = 100: must divide n_envs x n_steps = 512": lambda: with_line("128", "100"),
-    "mine.yaml, line 4: n_envs = 999999: n_envs x n_steps = 31999968 decisions": lambda: with_line("16", "999999"),
     "mine.yaml, line 19: observation = [frnt_1]: unknown feature": lambda: with_line(
         "updates: 3", "updates: 3\nobservation: [frnt_1]"
     ),
-    "recipe 'sac': n_steps: unknown key; did": lambda: load_recipe("sac").replace(n_steps=3),
     "recipe 'sac': ent_coef = -1: must be 'auto' or a finite number": lambda: load_recipe("sac").replace(ent_coef=-1),
-    "recipe 'sac': buffer_size = 3: must be at least n_envs = 128": lambda: load_recipe("sac").replace(buffer_size=3),
     "recipe 'ppo': device: unknown key; known: name": lambda: PPO.replace(device="cpu"),
-    "recipe 'ppo': seed = 1.5: must be a whole number": lambda: PPO.replace(seed=1.5),
 }
 
 
@@ -138,15 +130,6 @@ def test_replace__takes_any_mapping_and_sequence() -> None:
     assert expected.replace(reward=expected.reward, learning_rate=PPO.learning_rate) == expected
 
 
-@pytest.mark.usefixtures("empty_folder")
-def test_load_recipe__finds_files_at_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    (tmp_path / "mine.yaml").write_text(GOOD)
-    assert load_recipe("~/mine.yaml") == load_recipe(tmp_path / "mine.yaml")
-    with refused("elsewhere/mine.yaml: the file does not exist"):
-        load_recipe("elsewhere/mine.yaml")
-
-
 def test_learning_rate__falls_as_a_cosine() -> None:
     rate = LearningRate(start=1.0, end=0.2)
     assert [rate.at(remaining) for remaining in (1.0, 0.5, 0.0, -0.1)] == pytest.approx([1.0, 0.6, 0.2, 0.2])
@@ -159,7 +142,6 @@ def test_learning_rate__falls_as_a_cosine() -> None:
         ("My algorithm", PpoRecipe, Ppo, "algorithm 'My algorithm': the name must have 1 to 64 characters"),
         ("new", dict, Ppo, "algorithm 'new': recipe = <class 'dict'>: must be a subclass of TrainingRecipe"),
         ("new", PpoRecipe, "nowhere", "algorithm 'new': algorithm = 'nowhere': must be a class with the method build"),
-        ("new", PpoRecipe, dict, "algorithm 'new': algorithm = <class 'dict'>: must be a class with the method"),
     ],
 )
 def test_register_algorithm__is_refused(name: str, recipe: Any, algorithm: Any, message: str) -> None:

@@ -127,7 +127,7 @@ def test_resume__after_a_kill_while_a_checkpoint_is_written(
     assert not list(run.glob("**/.ethbrake-*"))
 
 
-@pytest.mark.parametrize("nth", [1, 2, 4])
+@pytest.mark.parametrize("nth", [1, 4])
 def test_resume__after_an_error_and_a_kill_while_policies_are_replaced(
     nth: int, whole: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,15 +175,10 @@ class Evil:
 
 DAMAGE = {
     "a byte": spoil,
-    "half of it": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
-    "text": lambda path: path.write_text("hello"),
     "code": lambda path: torch.save({"training": Evil()}, path),
     "other data": lambda path: torch.save({"training": 1}, path),
-    "a list": lambda path: torch.save([1], path),
-    "steps in words": lambda path: torch.save({**checkpoint.read(path), "steps": "many"}, path),
     "a link": lambda path: (path.unlink(), path.symlink_to("/dev/zero")),
     "a link to a sound one": lambda path: path.symlink_to(path.rename(path.parent.parent / "elsewhere.pt")),
-    "a link to the one before": lambda path: (path.unlink(), path.symlink_to(checkpoint.files_in(path.parent)[-1])),
 }
 
 
@@ -217,10 +212,7 @@ def forged(saved: dict[str, Any], place: str, value: Any) -> None:
 FORGED = {
     "model/environment/stream": [1],
     "model/environment/episode": [torch.zeros(8, 7, 3, dtype=torch.float64)],
-    "model/environment/_steps": torch.zeros(8),
-    "model/environment": {},
     "model/torch": torch.zeros(3, dtype=torch.uint8),
-    "model/parameters/policy": {},
     "model/parameters/policy/log_std": torch.full((1,), float("nan")),
     "course/best": [{"policy.0.weight": torch.zeros(1)}],
 }
@@ -261,7 +253,7 @@ def test_resume__one_process_at_a_time(run: Path) -> None:
         go_on(run)
 
 
-LINKS = {"checkpoints": True, "policy": True, "run.lock": True, "progress.csv": False}  # is the run refused then?
+LINKS = {"policy": True, "run.lock": True, "progress.csv": False}  # is the run refused then?
 
 
 @pytest.mark.parametrize("name", LINKS)

@@ -31,7 +31,7 @@ from ethbrake_marl.progress import Progress
 from ethbrake_marl.training import train as train_module
 from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.ppo import Ppo
-from ethbrake_marl.training.recipe import ALGORITHMS, TrainingRecipe, algorithm_of, load_recipe, register_algorithm
+from ethbrake_marl.training.recipe import ALGORITHMS, TrainingRecipe, algorithm_of, register_algorithm
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.train import make_environment, make_model, train
 from ethbrake_marl.training.training import Training
@@ -40,7 +40,7 @@ from tests.refused import refused
 from tests.training.tiny import PAIR, TINY, TINY_SAC, TRAININGS, UPDATE, begin, dying_after, go_on, kept, killed
 
 
-@pytest.mark.parametrize("name", ["ppo", "shared", "independent"])
+@pytest.mark.parametrize("name", ["shared", "independent"])
 def test_policies__know_the_range_of_their_training(name: str, tmp_path: Path) -> None:
     result = begin(name, tmp_path / "run")
     for policies in (result.policies, result.last_policies):
@@ -133,11 +133,8 @@ def test_train__is_the_same_twice_and_leaves_the_global_generators(tmp_path: Pat
 
 
 REMAINDERS: dict[str, tuple[str, dict[str, Any], list[int], list[int]]] = {  # training, change, measured, rows
-    "one update more": ("ppo", {"total_steps": 7 * UPDATE}, [0, 3, 6, 7], [*range(8)]),
     "a part of an update": ("ppo", {"total_steps": 3 * UPDATE + 1}, [0, 3, 4], [*range(5)]),
-    "less than one update": ("ppo", {"total_steps": 1}, [0, 1], [0, 1]),
     "two learners": ("independent", {"total_steps": 2 * 5 * UPDATE}, [0, 3, 5], [*range(6)]),
-    "rows are rarer": ("sac", {"total_steps": 37 * 8}, [0, 30, 37], [0, 10, 20, 30, 37]),
     "between two rows": ("sac", {"total_steps": 9 * 8 + 1}, [0, 10], [0, 10]),
 }
 
@@ -159,7 +156,7 @@ def test_train__an_end_between_two_measurements_or_rows_is_measured_and_stored(c
         assert policy.manifest.weights_sha256 == same[vehicle].manifest.weights_sha256
 
 
-@pytest.mark.parametrize("default", [torch.float64, torch.float16, torch.bfloat16, "meta", "inside"], ids=str)
+@pytest.mark.parametrize("default", [torch.float64, "meta", "inside"], ids=str)
 @pytest.mark.parametrize("recipe", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
 def test_train__has_the_same_bits_whatever_torchs_defaults_are(
     default, recipe, tiny_recipe, tiny_sac, tmp_path
@@ -225,8 +222,6 @@ def full(text: str) -> int:
 STREAMS: dict[str, Callable[[], Any]] = {
     "none": lambda: None,
     "closed": closed,
-    "without isatty": lambda: SimpleNamespace(write=len, flush=lambda: None),
-    "without flush": lambda: SimpleNamespace(write=len, isatty=lambda: False),
     "full": lambda: SimpleNamespace(write=full, flush=lambda: None, isatty=lambda: True),
 }
 
@@ -295,11 +290,10 @@ def test_train__a_second_ctrl_c_stops_at_once(tmp_path: Path) -> None:
     assert kept(tmp_path / "run") == kept(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_train__a_signal_stops_it_after_the_update_and_leaves_no_handler(number: int, tmp_path: Path) -> None:
+def test_train__a_signal_stops_it_after_the_update_and_leaves_no_handler(tmp_path: Path) -> None:
     before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
     with pytest.MonkeyPatch.context() as patch:
-        disturb(patch, {40: lambda _: os.kill(os.getpid(), number)})
+        disturb(patch, {40: lambda _: os.kill(os.getpid(), signal.SIGTERM)})
         assert begin("ppo", tmp_path / "run").status == "interrupted"
     assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == before
     go_on(tmp_path / "run")
@@ -314,7 +308,7 @@ SPOILED: dict[str, Callable[[Any], Any]] = {
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning", "ignore:invalid value:RuntimeWarning")
-@pytest.mark.parametrize(("name", "kind"), [("ppo", "rewards"), ("ppo", "huge"), ("sac", "rewards"), ("sac", "huge")])
+@pytest.mark.parametrize(("name", "kind"), [("ppo", "rewards"), ("sac", "huge")])
 def test_train__numbers_that_are_not_finite_stop_it(
     name: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -380,15 +374,6 @@ def a2c() -> Iterator[dict[str, Any]]:
     del ALGORITHMS.loaded["a2c"]
 
 
-def test_algorithm__of_a_user_trains_resumes_to_the_bit_and_drives(a2c: dict[str, Any], tmp_path: Path) -> None:
-    recipe = load_recipe(a2c)
-    whole = train(recipe, "paper-random", tmp_path / "whole", on_progress=None)
-    killed(train, recipe, "paper-random", tmp_path / "run", on_progress=dying_after(5))
-    go_on(tmp_path / "run")
-    assert kept(tmp_path / "run") == kept(tmp_path / "whole")
-    assert load_policy(tmp_path / "run").manifest.algorithm == "a2c" and whole.updates == 9
-
-
 class Gambling(A2c):
     """Moves a weight, after every update, by random numbers of all generators that a user may have used."""
 
@@ -406,15 +391,16 @@ class Gambling(A2c):
         return model
 
 
-def test_algorithm__that_draws_from_any_generator_resumes_to_the_bit(
+def test_algorithm__of_a_user_that_draws_from_any_generator_resumes_to_the_bit(
     a2c: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(ALGORITHMS.loaded, "a2c", (A2cRecipe, Gambling))
-    train(a2c, "paper-random", tmp_path / "whole", measure=None, on_progress=None)
+    whole = train(a2c, "paper-random", tmp_path / "whole", measure=None, on_progress=None)
     killed(train, a2c, "paper-random", tmp_path / "run", measure=None, on_progress=dying_after(5))
     random.seed(1)
     go_on(tmp_path / "run", measure=None)
     assert kept(tmp_path / "run") == kept(tmp_path / "whole")
+    assert load_policy(tmp_path / "run/policy-last").manifest.algorithm == "a2c" and whole.updates == 9
 
 
 def test_algorithm__that_normalises_by_itself_is_refused(a2c: dict[str, Any], tmp_path: Path) -> None:
@@ -477,9 +463,7 @@ def test_training__has_an_identity_of_all_but_words() -> None:
 REFUSED: dict[str, Any] = {
     "scenario 'cooperation-3-pair' has no learner": (TINY, {}, []),
     "scheme single: scenario 'cooperation-3-pair' has 2 learners": (TINY, {"scheme": "single"}, None),
-    "scheme independent: needs several learners": (TINY, {"scheme": "independent"}, ["vehicle_2"]),
     "the algorithm sac of recipe 'sac' does not support": (TINY_SAC, {"scheme": "centralised"}, None),
-    "recipe 'ppo': seed = -1: must be": (TINY, {"seed": -1}, None),
 }
 
 
@@ -532,16 +516,11 @@ def changed(run: Path, file: str, **content: Any) -> None:
 
 HOSTILE: dict[str, Any] = {
     ": is not the folder of a run; name the folder": lambda run: [path.unlink() for path in run.glob("*.json")],
-    "run.json: status = 'done': must be": lambda run: changed(run, "run.json", status="done"),
     "run.json: is damaged: ": lambda run: (run / "run.json").write_text("{"),
     "config.json: the file does not exist": lambda run: (run / "config.json").unlink(),
-    "config.json: does not describe a training ('recipe')": lambda run: (run / "config.json").write_text("{}"),
     "config.json: does not describe a training": lambda run: changed(run, "config.json", scenario=3),
     "config.json: scenario 'paper-random': horizon_s": lambda run: changed(
         run, "config.json", scenario={"name": "paper-random", "horizon_s": -1}
-    ),
-    "config.json: recipe: gamma: missing": lambda run: changed(
-        run, "config.json", recipe=TINY.model_dump(mode="json", exclude={"gamma"})
     ),
     "policy: must be a plain folder": lambda run: (run / "policy").write_text(""),
 }

@@ -77,11 +77,8 @@ def test_limits__are_those_of_all_quantities() -> None:
     assert RANGES.keys() == QUANTITIES.keys()
 
 
-CASES = [  # each quantity as a number and in one other form, which some quantities have not
-    (key, form)
-    for k, key in enumerate(RANGES)
-    for form in ("number", [*FORMS][1 + k % 3])
-    if (QUANTITIES[key].per, form) != ("world", "list")
+CASES = [  # each quantity as a number, and one in all other forms
+    (key, form) for k, key in enumerate(RANGES) for form in [*FORMS][: 1 if k else None]
 ]
 
 
@@ -113,12 +110,8 @@ OTHERS: dict[str, tuple[list[Any], list[Any]]] = {  # key -> accepted, refused
 }
 CHANNEL: dict[str, tuple[list[Any], list[Any]]] = {
     "lost": ([0.0, 1.0], [-LEAST, math.nextafter(1.0, 2.0)]),
-    "loss_begins": ([0.0, 1.0], [-LEAST, math.nextafter(1.0, 2.0)]),
     "loss_ends": ([0.01, 1.0], [math.nextafter(0.01, 0.0), math.nextafter(1.0, 2.0)]),
     "message_period_s": ([1e-3, 60.0], [math.nextafter(1e-3, 0.0), math.nextafter(60.0, 61.0)]),
-    "radio_s": ([0.0, 60.0], [-LEAST, math.nextafter(60.0, 61.0)]),
-    "processing_s": ([0.0, 60.0], [-LEAST, math.nextafter(60.0, 61.0)]),
-    "actuation_s": ([0.0, 60.0], [-LEAST, math.nextafter(60.0, 61.0)]),
     "link_latency_s": ([0.0, 60.0], [-LEAST, math.nextafter(60.0, 61.0)]),
     "sensing_s": ([[0.0, 60.0], [1.0, 1.0]], [[-LEAST, 1.0], [0.0, math.nextafter(60.0, 61.0)], [1.0, 0.5]]),
 }
@@ -173,7 +166,7 @@ def test_weight__at_its_limit_is_accepted_and_beyond_it_is_refused() -> None:
             assert [accepts({**BASE, **choice}), accepts(mixture), accepts({**BASE, **types})] == [right] * 3, value
 
 
-@pytest.mark.parametrize("key", ["gaps_m", "speeds_mps", "latency_s", "mass_t", "restitution"])
+@pytest.mark.parametrize("key", ["gaps_m", "restitution"])
 def test_given_world__at_a_limit_is_accepted_and_beyond_it_is_refused(key: str) -> None:
     low, high, more = RANGES[key]
     scenario = Scenario(**content(key, BASE.get(key, 0.5), more))

@@ -1,6 +1,5 @@
 """What a scenario may not say, and what its methods refuse."""
 
-import copy
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -53,29 +52,20 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "line 15: gaps_km: unknown key; did you mean gaps_m (metres)?": lambda: given(gaps_m=None, gaps_km="0.007"),
     "line 15: restituton: unknown key; did you mean restitution?": lambda: given(restitution=None, restituton="0.1"),
-    "line 15: zzz: unknown key": lambda: given(restitution=None, zzz="0.1"),
     "bad.yaml: gaps_m: missing; write, for instance, gaps_m: 7, or time_gaps_s: 1": lambda: given(gaps_m=None),
-    "bad.yaml: name: missing; write, for instance, name: my-scenario": lambda: given(name=None),
     "line 5: gaps_m = -1: must be finite and in [0, 10000] m (metres)": lambda: given(gaps_m="-1"),
-    "line 5: gaps_m: has 3 entries; must have 2, one per pair, or be a single": lambda: given(gaps_m="[7, 7, 7]"),
     "line 5: gaps_m = []: must not be empty": lambda: given(gaps_m="[]"),
     'line 5: gaps_m = "7": must be a number, not text; write it without quotes': lambda: given(gaps_m='"7"'),
     "line 5: gaps_m = true: must be a number or a distribution": lambda: given(gaps_m="true"),
     "line 5: gaps_m = null: must have a value; leave the key out if you do not need it": lambda: given(gaps_m=""),
     "line 5: gaps_m[1] (vehicle_2 to vehicle_3) = .inf: must be a finite number": lambda: given(gaps_m="[7, .inf]"),
-    "line 5: gaps_m[0] (vehicle_1 to vehicle_2) = [7]: must be a number or a distribution, {uniform": lambda: given(
-        gaps_m="[[7], 7]"
-    ),
     "{lognormal: {median, sigma, low, high}} or {choice: [a, b, ...]}; did you mean uniform?": lambda: given(
         gaps_m="{unifrom: [5, 9]}"
     ),
-    "line 5: gaps_m.uniform = 5: must be a list": lambda: given(gaps_m="{uniform: 5}"),
     "line 5: gaps_m.uniform[1]: missing; write {uniform: [low, high]}, {loguniform": lambda: given(
         gaps_m="{uniform: [5]}"
     ),
-    "line 5: gaps_m.uniform = [5, 6, 7]: must have 2 entries": lambda: given(gaps_m="{uniform: [5, 6, 7]}"),
     "line 5: gaps_m.uniform = [9, 6]: low must not be above high": lambda: given(gaps_m="{uniform: [9, 6]}"),
-    "line 5: gaps_m.uniform[1] = .nan: must be a finite number": lambda: given(gaps_m="{uniform: [5, .nan]}"),
     "line 5: gaps_m.choice: cannot be combined with the other keys here; a quantity has only one": lambda: given(
         gaps_m="{uniform: [5, 9], choice: [7]}"
     ),
@@ -85,23 +75,12 @@ REFUSED: dict[str, Callable[[], object]] = {
     "line 5: gaps_m.normal.std: unknown key; did you mean sd?": lambda: given(
         gaps_m="{normal: {mean: 7, std: 1, low: 5, high: 9}}"
     ),
-    "line 5: gaps_m.normal.sd = 0: must be greater than 0": lambda: given(
-        gaps_m="{normal: {mean: 7, sd: 0, low: 5, high: 9}}"
-    ),
-    "line 5: gaps_m.normal = {mean: 7, sd: 1, low: 9, high: 9}: low must be below high": lambda: given(
-        gaps_m="{normal: {mean: 7, sd: 1, low: 9, high: 9}}"
-    ),
     "line 5: gaps_m.normal = {mean: 7, sd: 1, low: 20, high: 99}: the untruncated distribution must": lambda: given(
         gaps_m="{normal: {mean: 7, sd: 1, low: 20, high: 99}}"
     ),
-    "line 5: gaps_m.choice = []: must not be empty": lambda: given(gaps_m="{choice: []}"),
     "line 5: gaps_m.weights = [1]: must have as many entries as choice (2)": lambda: given(
         gaps_m="{choice: [7, 8], weights: [1]}"
     ),
-    "line 5: gaps_m.weights[1] = 0: must be greater than 0": lambda: given(gaps_m="{choice: [7, 8], weights: [1, 0]}"),
-    "line 5: gaps_m.loguniform[0] = 0: must be greater than 0": lambda: given(gaps_m="{loguniform: [0, 1]}"),
-    "line 9: mass_t[1] (vehicle_2) = -5.5: must be finite and in (0, 1000] t": lambda: given(mass_t="[4.5, -5.5, 5.9]"),
-    "line 7: braking_capacity_mps2 = 0: must be finite and in (0, 100] m/s2": lambda: given(braking_capacity_mps2="0"),
     "line 6: speeds_mps[2] (vehicle_3) = {choice: [3, 41]}: vehicle_3 has a speed of 3 to 41": lambda: given(
         speeds_mps="[1, 2, {choice: [3, 41]}]"
     ),
@@ -111,10 +90,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "line 10: latency_s[2] (vehicle_3) = 8: vehicle_3 may not be able to act until 8 s; this": lambda: given(
         latency_s="[0, 0.5, 8]"
     ),
-    "line 12: restitution = 1.01: must be finite and in [0, 1]": lambda: given(restitution="1.01"),
     "line 3: time_step_s = 9: must not be above horizon_s (8 s)": lambda: given(time_step_s="9"),
-    "line 4: horizon_s = -8: must be greater than 0": lambda: given(horizon_s="-8"),
-    "line 2: vehicles = 1: must be greater than or equal to 2": lambda: given(vehicles="1"),
     "must be a whole number, written without a decimal point or an exponent": lambda: given(vehicles="3.0"),
     "unknown vehicle; this scenario has vehicle_1 ...": lambda: given(roles="{vehicle_2: learner, vehicle_4: coast}"),
     "line 13: roles.vehicel_2: unknown vehicle; did you mean vehicle_2?": lambda: given(roles="{vehicel_2: learner}"),
@@ -124,13 +100,9 @@ REFUSED: dict[str, Callable[[], object]] = {
     "line 13: roles.vehicle_2 = learner:1: agent 'learner:1': learner takes no argument": lambda: given(
         roles="{vehicle_2: learner:1}"
     ),
+    "line 13: roles = [learner]: must be a mapping": lambda: given(roles="[learner]"),
     "line 13: roles.vehicle_2 = mine.py:drive: agent 'mine.py:drive': is a function in a Python file": lambda: given(
         roles="{vehicle_2: mine.py:drive}"
-    ),
-    "line 13: roles.vehicle_2 = 2: must be learner or the name of a script": lambda: given(roles="{vehicle_2: 2}"),
-    "line 13: roles = [learner]: must be a mapping": lambda: given(roles="[learner]"),
-    "line 13: roles.vehicle_1 = constant: agent 'constant': constant needs a finite deceleration": lambda: given(
-        roles="{vehicle_1: constant, vehicle_2: learner}"
     ),
     "line 7: braking_capacity_mps2[0] (vehicle_1) = 6: must be at least 7 m/s2 on the road, because": lambda: given(
         roles="{vehicle_1: constant:7, vehicle_2: learner}"
@@ -146,18 +118,11 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "line 14: early_impacts = refuse: must be keep or reject": lambda: given(early_impacts="refuse"),
     "must be 1 to 64 lower case letters, digits, - and _, beginning with a letter": lambda: given(name="Bad Name"),
-    "bad.yaml: speeds_mps: missing; write, for instance, speeds_mps: 20": lambda: given(speeds_mps=None, gaps_m="7"),
     "line 15: time_gaps_s = 1: give either gaps_m or time_gaps_s, not both": lambda: given(
         gaps_m="7", time_gaps_s="1", speeds_mps="20"
     ),
-    "line 15: line_speed_mps = 20: give either speeds_mps or line_speed_mps, not both": lambda: given(
-        gaps_m="7", speeds_mps="20", line_speed_mps="20"
-    ),
     "line 15: speed_deviations_mps = 0: can be used only with line_speed_mps, the speed to which": lambda: given(
         gaps_m="7", speeds_mps="20", speed_deviations_mps="0"
-    ),
-    "line 15: time_gaps_s[1] (vehicle_2 to vehicle_3) = 61: must be finite and in (0, 60] s": lambda: given(
-        gaps_m=None, time_gaps_s="[1, 61]", speeds_mps="20"
     ),
     "line 15: line_speed_mps = {uniform: [1, 38]}: vehicle_2 has a speed of -1 to 40 m/s; its speed": lambda: given(
         speeds_mps=None,
@@ -166,17 +131,10 @@ REFUSED: dict[str, Callable[[], object]] = {
         speed_deviations_mps="[0, {uniform: [-2, 2]}, 0]",
     ),
     "give either obstacle_gap_m or obstacle_margin_m": lambda: given(obstacle_margin_m="1.7", obstacle_gap_m="42"),
-    "line 15: obstacle_margin_m = 0: must be finite and in (0, 10000] m (metres)": lambda: given(obstacle_margin_m="0"),
     "vehicle_1 can learn only with an obstacle ahead; add one, for": lambda: given(roles="{vehicle_1: learner}"),
-    "must be finite and in (0, 1e+06] m/s3 (metres per second cubed)": lambda: given(brake_rate_mps3="0"),
     "line 15: vehicle_types.any: any means every type, so it cannot be a name; use": lambda: given(
         vehicle_types="{any: {}}"
     ),
-    "line 15: vehicle_types = {}: must not be empty": lambda: given(vehicle_types="{}"),
-    "vehicle_types.car.mass_t = null: must have a value; leave the key out if": lambda: given(
-        vehicle_types="{car: {mass_t: null}}"
-    ),
-    "line 15: vehicle_types.car.weight = 0: must be greater than 0": lambda: given(vehicle_types="{car: {weight: 0}}"),
     "line 15: vehicle_types.car.load = 2: a load must be in [0, 1]": lambda: given(vehicle_types="{car: {load: 2}}"),
     "line 10: latency_s = [0, 0.5, 0.8]: must be left out, because every vehicle type": lambda: given(
         vehicle_types="{car: {latency_s: 3}}"
@@ -191,12 +149,8 @@ REFUSED: dict[str, Callable[[], object]] = {
     "line 1: mass_t: vehicle type bus does not declare mass_t; declare mass_t in this type, or": lambda: given(
         mass_t=None, vehicle_types="{car: {mass_t: 2}, bus: {braking_capacity_mps2: 5}}"
     ),
-    "line 9: mass_t = {with_load: [1, 2]}: must be a number or a distribution, {uniform: [low, high]}": lambda: given(
-        mass_t="{with_load: [1, 2]}"
-    ),
     "line 15: follower: unknown key; give the line one more vehicle": lambda: given(follower="{time_gap_s: 1}"),
     "line 15: v2x.senss: unknown key; did you mean senses?": lambda: given(v2x="{preset: nominal, senss: both}"),
-    "line 15: v2x.colour: unknown key; known: preset, hears,": lambda: given(v2x="{preset: nominal, colour: 3}"),
     "line 13: roles.vehicle_1 = {profile: [[0, 3]]}: must be learner or the name of a script, such as": lambda: given(
         roles="{vehicle_1: {profile: [[0, 3]]}, vehicle_2: learner}"
     ),
@@ -206,12 +160,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     "preset paper generates no messages; leave it out": lambda: given(v2x="{loss_begins: 0.1}"),
     "a vehicle that may never get a message must see the vehicle ahead; use senses: both or front": lambda: given(
         v2x="{preset: clear, senses: none}"
-    ),
-    "line 15: v2x.loss_ends = 0: must be greater than or equal to 0.01": lambda: given(
-        v2x="{preset: clear, loss_ends: 0}"
-    ),
-    "line 15: v2x.sensing_s = [2, 1]: low must not be above high": lambda: given(
-        v2x="{preset: clear, sensing_s: [2, 1]}"
     ),
     "line 15: v2x.radio_s = 0.1: has no effect, because link_latency_s fixes the delay of messages": lambda: given(
         v2x="{preset: clear, link_latency_s: 0.1, radio_s: 0.1}"
@@ -226,15 +174,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "mine.yaml, line 2: table.file = ../rows.csv: must be a relative path in the scenario's folder": lambda: loaded(
         "table: {file: ../rows.csv, columns: [gap_1_m]}"
     ),
-    "mine.yaml, line 2: mixture = 3: must be a list": lambda: loaded("mixture: 3"),
-    "mine.yaml, line 2: mixture = []: must not be empty": lambda: loaded("mixture: []"),
     "mine.yaml, line 2: mixture[0].scenario: missing; write, for instance": lambda: loaded("mixture: [{weight: 1}]"),
-    "mine.yaml, line 3: unknown scenario 'paper-randon'; did you mean 'paper-random'?": lambda: loaded(
-        "mixture:\n  - scenario: paper-randon"
-    ),
-    "mine.yaml, line 2: mixture[0].weight = 0: must be greater than 0": lambda: loaded(
-        "mixture: [{scenario: paper-random, weight: 0}]"
-    ),
     "mine.yaml, line 2: mixture[0].scenario: a mixture cannot contain another": lambda: loaded(
         "mixture: [{scenario: mixture-delays}]"
     ),
@@ -244,17 +184,11 @@ REFUSED: dict[str, Callable[[], object]] = {
     "mine.yaml, line 2: mixture: horizon_s must be the same in all scenarios of the mixture, but": lambda: loaded(
         "mixture: [{scenario: paper-random}, {scenario: stress-wide}]"
     ),
-    "mine.yaml, line 2: mixture: time_step_s must be the same in all scenarios of the mixture, but": lambda: loaded(
-        "mixture: [{scenario: paper-random}, {scenario: {name: x, based_on: cooperation-4-five, time_step_s: 0.05}}]"
-    ),
     "mine.yaml, line 2: mixture[0].scenario: mass_t: has the same value in paper-random; leave it out": lambda: loaded(
         "mixture: [{scenario: {name: x, based_on: paper-random, mass_t: [4.5, 5.5, 5.9]}}]"
     ),
     "mine.yaml, line 2: mixture[0].scenario: scenario 'paper-random': braking_capacity_mps2: has 3 entries": lambda: (
         loaded("mixture: [{scenario: paper-random}]\nvehicles: 5")
-    ),
-    "mine.yaml, line 2: mixture[0].scenario: scenario 'paper-random': horizon_s = -8: must be greater than 0": lambda: (
-        loaded("mixture: [{scenario: paper-random}]\nhorizon_s: -8")
     ),
     "mine.yaml, line 2: mixture[0].scenario: scenario 'x': massx: unknown key; did you mean mass_t (tonnes)?": lambda: (
         loaded("mixture: [{scenario: {name: x,\n   massx: 3}}]")
@@ -263,20 +197,13 @@ REFUSED: dict[str, Callable[[], object]] = {
         "vehicle_types: {car: {mass_t: 1, brake_rate_mps3: 9}, van: {mass_t: 2}}\n"
         + WHOLE.removesuffix(", mass_t: 1").replace(", ", "\n")
     ),
-    "x.yaml: must be a mapping of keys to values": lambda: Scenario.from_document(parse_yaml("", "x.yaml")),
     "scenario 'x': mixture[0].scenario = paper-random: must be the content of a scenario as a": lambda: Scenario(
         name="x", mixture=[{"scenario": "paper-random"}]
     ),
     "initial_state: scenario 'mixture-delays' is a mixture, so it is unknown to which of": lambda: worlds_from_state(
         DELAYS, {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
     ),
-    "scenario 'paper-random': mass_t[0] (vehicle_1) = -1: must be finite": lambda: PAPER.replace(mass_t=[-1, 2, 3]),
-    "scenario 'paper-random': objective = frontfirst: unknown objective": lambda: PAPER.replace(objective="frontfirst"),
     "objective 'maximin:3': maximin takes no argument": lambda: PAPER.replace(objective="maximin:3"),
-    "objective 'own:': own takes no argument": lambda: PAPER.replace(objective="own:"),
-    "objective 'vehicle_4': there is no vehicle_4; this scenario has vehicle_1 ... vehicle_3": lambda: PAPER.replace(
-        objective="vehicle_4"
-    ),
     "objective 'first:own,then:vehicle_4': there is no vehicle_4;": lambda: PAPER.replace(
         objective=["own", "own", "first:own,then:vehicle_4"]
     ),
@@ -287,12 +214,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     "objective = \"first:ownn,then:total\": unknown objective 'ownn'; did you mean 'own'?": lambda: PAPER.replace(
         objective="first:ownn,then:total"
     ),
-    "roles.vehicle_4: unknown vehicle; this scenario has vehicle_1 ... vehicle_3": lambda: PAPER.with_learners(
-        ["vehicle_4"]
-    ),
-    "learners = 'vehicle_2': must be a list of vehicles": lambda: PAPER.with_learners("vehicle_2"),
-    "roles of a scenario cannot be changed; make a new scenario with": lambda: given(roles=None).roles.clear(),
-    "scenario name '': must be 1 to 64 lower case letters, digits, - and _, beginning": lambda: new_scenario_text(""),
     "table.columns = gap_9_m: unknown column; did you mean": lambda: PAPER.replace(
         table={"columns": ["gap_9_m"], "rows": [[1]]}
     ),
@@ -301,9 +222,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "table.rows[1]: has 2 values; must have one for each of the 1 columns": lambda: PAPER.replace(
         table={"columns": ["gap_1_m"], "rows": [[1], [1, 2]]}
-    ),
-    "table.columns = [gap_1_m, gap_1_m]: must not list a column twice": lambda: PAPER.replace(
-        table={"columns": ["gap_1_m", "gap_1_m"], "rows": [[1, 2]]}
     ),
     "table.rows: must be given as lists here": lambda: PAPER.replace(table={"columns": ["gap_1_m"], "file": "x.csv"}),
     "gaps_m = 7: must be left out, because the table has columns of it for all": lambda: given(gaps_m="7").replace(
@@ -327,7 +245,7 @@ def test_mistake__is_refused_with_its_place_and_what_would_be_right(message: str
         REFUSED[message]()
 
 
-@pytest.mark.parametrize("copied", [PAPER, pickle.loads(pickle.dumps(PAPER)), copy.deepcopy(PAPER)])
+@pytest.mark.parametrize("copied", [PAPER, pickle.loads(pickle.dumps(PAPER))])
 def test_roles__are_frozen(copied: Scenario) -> None:
     for change in (
         lambda roles: roles.__setitem__("vehicle_3", "learner"), lambda roles: roles.__delitem__("vehicle_3"),
@@ -339,7 +257,7 @@ def test_roles__are_frozen(copied: Scenario) -> None:
             change(copied.roles)
 
 
-@pytest.mark.parametrize("spec", ["Full_brake", "2fast", "constant:", "constant: 3", "a\n"])
+@pytest.mark.parametrize("spec", ["Full_brake", "constant:", "a\n"])
 def test_agent_of_a_role__is_a_name_in_lower_case_and_an_argument(spec: str) -> None:
     with refused(f"agent {spec!r}: must be name or name:argument"):
         check_role(spec)
@@ -348,8 +266,7 @@ def test_agent_of_a_role__is_a_name_in_lower_case_and_an_argument(spec: str) -> 
 @pytest.mark.parametrize(
     "text",
     [
-        "first", "first:", "first:own,then:",
-        "first:own,then:own,then:own", "first:first:own,then:own,then:own", "first:own,then:first", "then:own",
+        "first", "first:first:own,then:own,then:own", "then:own",
     ],
 )  # fmt: skip
 def test_first__needs_two_objectives(text: str) -> None:
@@ -358,7 +275,7 @@ def test_first__needs_two_objectives(text: str) -> None:
         PAPER.replace(objective=text)
 
 
-@pytest.mark.parametrize("name", ["My Scenario", "x" * 65, "../x", "x\n"])
+@pytest.mark.parametrize("name", ["x" * 65, "x\n"])
 def test_name_of_a_new_scenario__is_a_plain_word(name: str) -> None:
     with refused(f"scenario name {name!r}: must be 1 to 64 lower case letters, digits, - and _"):
         new_scenario_text(name)
@@ -371,9 +288,7 @@ def test_unknown_scenario__is_told_what_is_near() -> None:
         load_scenario("zzz")
 
 
-@pytest.mark.parametrize(
-    ("file", "name"), [("other.yaml", "other"), ("Wet Five.yml", "wet-five"), ("_a.b,c+d.yaml", "a-b-c-d")]
-)
+@pytest.mark.parametrize(("file", "name"), [("Wet Five.yml", "wet-five"), ("_a.b,c+d.yaml", "a-b-c-d")])
 def test_file__gives_its_scenario_the_name(file: str, name: str, empty_folder: Path) -> None:
     Path(file).write_text(new_scenario_text("mine"))
     with pytest.warns(IgnoredName, match=f"line 13: name = mine is ignored: the file's name counts, so this is {name}"):

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from ethbrake_marl.worlds import sampling
@@ -46,22 +45,15 @@ REFUSED: dict[str, Callable[[], object]] = {
     "worlds.csv, line 1: columns are separated by semicolons; separate them by commas": lambda: read(
         HEADER.replace(",", ";") + "\n7,5;8;20;18;20\n"
     ),
-    "worlds.csv, line 1: columns are separated by tabs; separate them by commas": lambda: read(
-        HEADER.replace(",", "\t") + "\n7\t8\t20\t18\t20\n"
-    ),
-    "worlds.csv, line 1: unknown column 'gap_3_m'; did you mean gap_": lambda: read(HEADER + ",gap_3_m\n1,2,3,4,5,6\n"),
-    "worlds.csv, line 1: unknown column 'obstacle_gap_m'; ": lambda: read(HEADER + ",obstacle_gap_m\n1,2,3,4,5,6\n"),
     "worlds.csv, line 1: unknown column 'friction'; ": lambda: read(HEADER + ",friction\n1,2,3,4,5,0.5\n"),
     "worlds.csv, line 1: column 'agent': a column of your own needs another name": lambda: read(
         HEADER + ",agent\n1,2,3,4,5,x\n"
     ),
-    "worlds.csv, line 1: column '': a column of your own needs another name": lambda: read(HEADER + ",\n1,2,3,4,5,x\n"),
     "worlds.csv, line 1: column 'gap_1_m' occurs twice": lambda: read(HEADER + ",gap_1_m\n1,2,3,4,5,6\n"),
     "worlds.csv, line 2: has 4 values, but the header has 5 columns": lambda: read(HEADER + "\n10,8,20,18\n"),
     "worlds.csv, line 3, column speed_1_mps: 'fast' is not a number": lambda: read(
         HEADER + "\n10,8,20,18,20\n10,8,fast,18,20\n"
     ),
-    "worlds.csv, line 2, column speed_1_mps: 'nan' is not a number": lambda: read(HEADER + "\n10,8,nan,18,20\n"),
     "worlds.csv, line 3, column gap_2_m = -8: must be finite and in [0, 10000] m (metres)": lambda: read(
         HEADER + "\n10,8,20,18,20\n10,-8,20,18,20\n"
     ),
@@ -72,9 +64,7 @@ REFUSED: dict[str, Callable[[], object]] = {
         HEADER + ",latency_3_s\n10,8,20,18,20,8\n"
     ),
     "worlds.csv: cannot be read as CSV: unexpected end of data": lambda: read(HEADER + '\n"10,8,20,18,20\n'),
-    "worlds.csv, line 4: has 2 values, but the header has 5": lambda: read(HEADER + '\n"10\n",8,20,18,20\n10,8\n'),
     "worlds.csv: must have a header, for instance gap_1_m,gap_2_m,speed_1_mps,... and rows": lambda: read(""),
-    "none.csv: the file does not exist": lambda: read_worlds(PAPER, "none.csv"),
     "/dev/zero: is a device, a pipe or a socket; must be a plain file": lambda: read_worlds(PAPER, "/dev/zero"),
     "worlds.csv, line 2, column mass_2_t is missing; scenario 'paper-random' has no fixed value for it": lambda: read(
         HEADER + "\n10,8,20,18,20\n", PAPER.replace(mass_t=[4.5, {"uniform": [5, 6]}, 5.9])
@@ -82,30 +72,15 @@ REFUSED: dict[str, Callable[[], object]] = {
     "initial states: all columns must be lists of the same length; they have the shapes gap_1_m [2],": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [1, 2]})
     ),
-    "initial states: all columns must be lists of the same length; they have the shapes gap_1_m [],": lambda: (
-        worlds_from_table(PAPER, COLUMNS | {"gap_1_m": 1})
-    ),
     "initial states: gap_1_m = ['1', '2', '3']: must be a number or a list of numbers; no booleans, texts": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": ["1", "2", "3"]})
-    ),
-    "initial states: gap_1_m = [True, 2, 3]: must be a number or a list of numbers; no booleans, texts": lambda: (
-        worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [True, 2, 3]})
     ),
     "initial states: gap_1_m = [[1], [2, 3]]: must be a number or a list of numbers: setting an array": lambda: (
         worlds_from_table(PAPER, COLUMNS | {"gap_1_m": [[1], [2, 3]]})
     ),
-    "initial states, row 1, column speed_2_mps = nan: must be finite and in [0, 200] m/s (metres": lambda: (
-        worlds_from_table(PAPER, COLUMNS | {"speed_2_mps": [1, np.nan, 3]})
-    ),
-    "initial states: unknown column 'gaps_1_m'; did you mean gap_1_m (metres)?": lambda: worlds_from_table(
-        PAPER, COLUMNS | {"gaps_1_m": [1, 2, 3]}
-    ),
     "initial states, row 0, column obstacle_gap_m is missing; scenario": lambda: worlds_from_table(OBSTACLE, COLUMNS),
     "initial_state: unknown key 'obstacle_gap_m'; known: gaps_m, speeds_mps": lambda: worlds_from_state(
         PAPER, {"gaps_m": 7, "speeds_mps": 20, "obstacle_gap_m": 30}
-    ),
-    "initial_state: obstacle_gap_m = 0: must be finite and in (0, 10000] m": lambda: worlds_from_state(
-        OBSTACLE, {"gaps_m": 7, "speeds_mps": 20, "obstacle_gap_m": 0}
     ),
     "initial_state: speeds_mps[0] is missing; scenario 'paper-random' has no fixed value": lambda: worlds_from_state(
         PAPER, {"gaps_m": [7, 7]}
@@ -113,21 +88,8 @@ REFUSED: dict[str, Callable[[], object]] = {
     "initial_state: unknown key 'gap_m'; did you mean gaps_m (metres)?": lambda: worlds_from_state(
         PAPER, {"gap_m": [7, 7], "speeds_mps": 20}
     ),
-    "initial_state: restitution has shape [2]; must be one number": lambda: worlds_from_state(
-        PAPER, {"restitution": [0.1, 0.2]}
-    ),
     "initial_state: gaps_m has shape [3]; must be a list of 2 numbers (for 3 vehicles), or": lambda: worlds_from_state(
         PAPER, {"gaps_m": [7, 7, 7], "speeds_mps": 20}
-    ),
-    "initial_state: gaps_m[1] = -7: must be finite and in [0, 10000] m (metres)": lambda: worlds_from_state(
-        PAPER, {"gaps_m": [7, -7], "speeds_mps": 20}
-    ),
-    "initial_state: gaps_m = True: must be a number or a list of numbers; no booleans": lambda: worlds_from_state(
-        PAPER, {"gaps_m": True, "speeds_mps": 20}
-    ),
-    "initial_state = [7, 7]: must be a mapping such as {'gaps_m': [7, 7]}": lambda: worlds_from_state(PAPER, [7, 7]),
-    "initial_state: gaps_m[1] = 12000: must be finite and in [0, 10000] m (metres)": lambda: worlds_from_state(
-        PAPER.replace(time_gaps_s=[1, 60]), {"speeds_mps": [20, 20, 200], "speed_limit_mps": 200}
     ),
     "initial_state: with v2x: nominal, it is random what the vehicles learn about": lambda: worlds_from_state(
         PAPER.replace(v2x="nominal", early_impacts="keep"), {"gaps_m": 7, "speeds_mps": 20}
@@ -143,16 +105,10 @@ REFUSED: dict[str, Callable[[], object]] = {
     "initial_state: latency_s[1] = 0.5: vehicle_2 may not be able to act until 8.5 s": lambda: worlds_from_state(
         PAPER.replace(v2x={"preset": "sensors-only", "sensing_s": [1, 1]}), STATE | {"latency_s": [7.5, 0.5, 0.8]}
     ),
-    "initial states: type int: must be a mapping from columns to lists of numbers, a pandas or polars": lambda: (
-        worlds_from_table(PAPER, 3)
-    ),
     "number of worlds = 0: must be a whole number in 1..10000000": lambda: PAPER.sample(n=0, seed=1),
-    "number of worlds = 10000001: must be a whole number in 1..10000000": lambda: PAPER.sample(n=10000001, seed=1),
     "seed of the list = None: must be a whole number, at least 0": lambda: PAPER.sample(n=1, seed=None),
-    "first world = -1: must be a whole number in 0..4503599627370496": lambda: PAPER.sample(n=1, seed=1, first=-1),
     "first world = 4503599627370497: must be a whole number": lambda: PAPER.sample(n=1, seed=1, first=2**52 + 1),
     "sample: purpose = 'test': must be one of list, training": lambda: PAPER.sample(n=1, seed=1, purpose="test"),
-    "sample: purpose = ['list']: must be one of list, training": lambda: PAPER.sample(n=1, seed=1, purpose=["list"]),
     "scenario 'paper-random': early_impacts: reject, but in all 1000 draws of": lambda: CLOSE.sample(1, 0),
     "1000 draws of world 0 an impact happens before vehicle_3 can act; use larger": lambda: (
         CLOSE.replace(gaps_m=2, latency_s=[0, 0.5, 1]).with_learners(["vehicle_3"]).sample(1, 0)

@@ -1,6 +1,5 @@
 """Worlds that the user gives."""
 
-from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +23,9 @@ COLUMNS = {name: [7, 8] for name in HEADER.split(",")}
     ("scenario", "state", "expected"),
     [
         (PAPER, {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}, {"gaps_m": [7.0, 7.0], "latency_s": [0.0, 0.5, 0.8]}),
-        (PAPER, {"gaps_m": 7, "speeds_mps": np.full(3, 20)}, {"speeds_mps": [20.0] * 3}),
         (load_scenario("paper-scenario-1"), {}, {"gaps_m": [10.0, 8.0], "speeds_mps": [20.0, 18.0, 20.0]}),
         (line().replace(time_gaps_s=[0.5, 1]), {"speeds_mps": [30, 20, 10]}, {"gaps_m": [10.0, 10.0]}),
         (line(obstacle_margin_m=1.5), {"latency_s": 0, "braking_capacity_mps2": 4}, {"obstacle_gap_m": 51.5}),
-        (line(obstacle_gap_m=42), {}, {"obstacle_gap_m": 42.0}),
         (line(friction=0.5), {}, {"braking_capacity_mps2": [0.5 * 9.81] * 3}),
         (line(friction=0.5), {"friction": 0.25}, {"braking_capacity_mps2": [0.25 * 9.81] * 3}),
     ],
@@ -39,9 +36,7 @@ def test_state__is_filled_in_with_what_is_fixed(scenario: Any, state: Any, expec
     assert worlds.clock[:, 5].tolist() == [-1.0]
 
 
-@pytest.mark.parametrize(
-    "name", ["paper-random", "realistic-mixed-buildup", "paper-random-obstacle", "paper-random-preference"]
-)
+@pytest.mark.parametrize("name", ["realistic-mixed-buildup", "paper-random-obstacle", "paper-random-preference"])
 def test_table_of_what_was_drawn__is_the_same_worlds(name: str) -> None:
     scenario = load_scenario(name)
     drawn = scenario.draw(50, 3)
@@ -100,14 +95,8 @@ def test_label__that_a_measure_is_called_is_refused(empty_folder: Path) -> None:
 NUMBERS = {
     "object": lambda pandas, frame: frame.astype(object),
     "Int64": lambda pandas, frame: frame.astype("Int64"),
-    "Float64": lambda pandas, frame: frame.astype("Float64"),
     "pyarrow": lambda pandas, frame: frame.astype("float64[pyarrow]"),
-    "decimal": lambda pandas, frame: frame.map(Decimal),
-    "category": lambda pandas, frame: frame.assign(gap_1_m=pandas.Categorical(frame["gap_1_m"])),
-    "records": lambda pandas, frame: frame.to_records(index=False),
     "structured": lambda pandas, frame: np.array([(7,) * 5, (8,) * 5], [(name, float) for name in COLUMNS]),
-    "whole": lambda pandas, frame: np.array([(7,) * 5, (8,) * 5], [(name, np.uint8) for name in COLUMNS]),
-    "objects": lambda pandas, frame: {name: np.array([7, 8.0], object) for name in COLUMNS},
     "range": lambda pandas, frame: dict.fromkeys(COLUMNS, range(7, 9)),
 }
 
@@ -132,16 +121,9 @@ def test_table__may_be_of_polars() -> None:
 @pytest.mark.parametrize(
     ("cells", "message"),
     [
-        (lambda pandas: [7, None], ", row 1, column gap_1_m = nan: must be finite"),
         (lambda pandas: pandas.array([7, None], dtype="Int64"), ", row 1, column gap_1_m = nan: must be finite"),
-        (lambda pandas: pandas.Series([7.0, pandas.NA], dtype=object), ", row 1, column gap_1_m = nan: must be finite"),
         (lambda pandas: pandas.Series([7.0, "8"], dtype=object), ": gap_1_m = Series of object: must be a number or a"),
-        (
-            lambda pandas: pandas.Series([7.0, True], dtype=object),
-            ": gap_1_m = Series of object: must be a number or a",
-        ),
         (lambda pandas: pandas.to_datetime(["2020-01-01"] * 2), ": gap_1_m = DatetimeIndex of datetime64["),
-        (lambda pandas: np.array([7, 10**400], object), ": gap_1_m = ndarray of object: must be a number or a list"),
         (lambda pandas: {0: 7, 1: 8}, ": gap_1_m = {0: 7, 1: 8}: must be a number or a list of numbers"),
     ],
 )
@@ -150,9 +132,7 @@ def test_column__of_other_cells_is_refused_without_the_table(cells: Any, message
         worlds_from_table(PAPER, {**COLUMNS, "gap_1_m": cells(pytest.importorskip("pandas"))})
 
 
-@pytest.mark.parametrize(
-    "table", [None, 3, "worlds.csv", [COLUMNS], np.ones((2, 5)), {1}, iter([])], ids=lambda table: type(table).__name__
-)
+@pytest.mark.parametrize("table", [3, "worlds.csv", np.ones((2, 5))], ids=lambda table: type(table).__name__)
 def test_what_is_no_table__is_refused_by_its_type(table: Any) -> None:
     accepted = "must be a mapping from columns to lists of numbers, a pandas or polars frame, a pyarrow table, or"
     with refused(f"initial states: type {type(table).__name__}: {accepted}"):

@@ -177,27 +177,6 @@ def test_env__draws_its_first_world() -> None:
         LineEnv(PAIR, 3, 5).render("film")
 
 
-def test_experiment__writes_films(tmp_path: Path) -> None:
-    from benchmarl.algorithms import MappoConfig
-    from benchmarl.experiment import Experiment, ExperimentConfig
-    from benchmarl.models.mlp import MlpConfig
-
-    from ethbrake_marl.extensions.benchmarl.task import LineTask
-
-    config = ExperimentConfig.get_from_yaml()
-    config.max_n_iters, config.max_n_frames, config.save_folder = 1, None, str(tmp_path)
-    config.on_policy_n_envs_per_worker, config.on_policy_collected_frames_per_batch = 8, 160
-    config.on_policy_n_minibatch_iters, config.evaluation_interval, config.evaluation_episodes = 1, 160, 2
-    config.evaluation, config.render, config.loggers, config.create_json = True, True, ["csv"], False
-    task, learns = LineTask("pair", {"scenario": "cooperation-3-pair"}), MappoConfig.get_from_yaml()
-    experiment = Experiment(task, learns, MlpConfig.get_from_yaml(), 0, config, MlpConfig.get_from_yaml())
-    experiment.logger.loggers[0].experiment.video_format = "pt"  # mp4 needs a torchvision for this build of torch
-    experiment.run()
-    (film,) = [torch.load(file) for folder in tmp_path.rglob("videos") for file in folder.iterdir()]
-    assert film.dtype == torch.uint8 and film.shape[1] > 10 and film.shape[2] == 3
-    assert len({picture.numpy().tobytes() for picture in film[0]}) > 10  # it moves
-
-
 def test_tasks__are_the_scenarios_with_a_learner() -> None:
     from benchmarl.environments import task_config_registry
 

@@ -106,10 +106,9 @@ def test_the_bound__is_the_harm_of_the_worst_corner() -> None:
     assert (found.harm > 0.99 * found.first).sum() > 5 and found.replaced.sum() > 80
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
-def test_no_width__is_step_mode_to_the_bit(count: str) -> None:
+def test_no_width__is_step_mode_to_the_bit() -> None:
     agents = "ppo+step,ppo+robust:latency_s=0:mass_t=0%"
-    result = eb.evaluate("paper-random", agents, episodes=40, harm_count=count).columns
+    result = eb.evaluate("paper-random", agents, episodes=40, harm_count="total").columns
     for column in ("total_harm", "replaced_actions"):
         step, wide = (each[column].tolist() for each in result.values())
         assert step == wide
@@ -137,9 +136,7 @@ def test_bound_at_the_alert__by_hand() -> None:
 @pytest.mark.parametrize(
     ("intervals", "steps"),
     [
-        ("gaps_m=2", 3),  # 13 m in the worst corner: 3 m too many
         ("braking_capacity_mps2.vehicle_2=20%", 2),  # 12.5 m to stop with 4 m/s2: 2.5 m
-        ("speeds_mps.vehicle_2=2", 0),  # 12 m/s: 14.4 m to stop; 0.6 m is half a step
         ("mass_t=50%", 5),  # changes nothing before an impact
     ],
 )
@@ -210,17 +207,11 @@ def test_names_and_environments__put_it_around_a_policy() -> None:
 
 TEXTS = {  # an uncertainty as a text -> what is wrong with it, some only in a world
     "": "must be quantity=half-width",
-    "latency_s=-0.1": "must be quantity=half-width",
-    "latency_s=nan": "must be quantity=half-width",
-    "latency_s=1e999": "must be a finite number",
     "latency_s=100%": "must be a finite number, or a share below 100 %",
-    "latency_s.vehicle_0=0.1": "must be quantity=half-width",
     "latency_s.pair_1=0.1": "only gaps_m may name a pair",
     "latency_s=0.1,latency_s.vehicle_2=0.2": "intervals of the same quantity",
     "mass_t.vehicle_4=0.1": "there is no such vehicle, because the line has 3",
-    "gaps_m.pair_3=0.1": "there is no such pair, because the line has 2",
     "mass_t=1": "the value 1 of vehicle_1 in world 0 may be from 0 to 2; must be finite and in (0, 1000]",
-    "gaps_m=1e308": "must be finite",
     "latency_s=0.1,mass_t=0.1,speeds_mps=1,gaps_m=1": "at most 1024",
     "brake_rate_mps3=1": "declare brake_rate_mps3 in the scenario",
 }
@@ -233,9 +224,6 @@ def test_uncertainty__as_a_text_is_refused(text: str) -> None:
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "uncertainty = None: must be a text, for instance 'braking_capacity": lambda: eb.make_agent(
-        "ppo+robust", scenario=PAPER
-    ),
     "shield 'ppo+robust:gaps_m=1': 'gaps_m=1' cannot follow the colon": lambda: eb.shield(
         eb.Team("ppo", {}), mode="robust:gaps_m=1", uncertainty="mass_t=1"
     ),
@@ -244,9 +232,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     "vehicle_3 of world 1 is to accelerate with -5.5 m/s2, which may be beyond its capacity": lambda: members(
         "braking_capacity_mps2.vehicle_3=10%", State.join([
             PAPER.replace(roles={"vehicle_3": role}).sample(1, 7) for role in ("constant:5", "constant:5.5")])
-    ),
-    "vehicle_1 of world 0 is to accelerate with -5.9 m/s2, which may be beyond its capacity": lambda: members(
-        "braking_capacity_mps2=10%", PAPER.replace(roles={"vehicle_1": "constant:5.9"}).sample(1, 7)
     ),
 }  # fmt: skip
 
@@ -257,10 +242,9 @@ def test_use__is_refused(message: str) -> None:
         REFUSED[message]()
 
 
-@pytest.mark.parametrize("text", ["latencys=0.1", "friction=0.1"])
-def test_quantity__is_unknown(text: str) -> None:
-    with refused(f"uncertain quantity {text.partition('=')[0]!r}", UnknownName):
-        parse_uncertainty(text)
+def test_quantity__is_unknown() -> None:
+    with refused("uncertain quantity 'friction'", UnknownName):
+        parse_uncertainty("friction=0.1")
 
 
 def test_capacity__is_that_on_the_road() -> None:

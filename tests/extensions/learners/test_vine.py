@@ -74,15 +74,6 @@ def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> 
 PLAN = VINE.replace(observation=["own", "plan", "role"], network={"policy": [8, 6, 5], "initial_action": "plan.action"})
 
 
-def test_untrained_policy__brakes_as_the_plan_that_it_begins_as(tmp_path: Path) -> None:
-    still = PLAN.replace(learning_rate={"start": 1e-12, "end": 1e-12}, total_steps=1)
-    policy = train(still, "paper-random", tmp_path / "run", measure=None, on_progress=None).policy
-    agents = {"plan": "plan", "policy": eb.LearnedAgent(policy)}
-    results = eb.evaluate("paper-random", agents, episodes=200)
-    assert np.ptp(results["plan"]["honest_cost"]) > 10.0
-    np.testing.assert_allclose(results["policy"]["honest_cost"], results["plan"]["honest_cost"], atol=1e-6)
-
-
 def test_network__begins_as_a_feature_exactly_and_can_learn_from_all_others() -> None:
     torch.manual_seed(0)
     actor = Actor(["own.speed", "plan.action", "own.mass"], PLAN)
@@ -95,10 +86,7 @@ def test_network__begins_as_a_feature_exactly_and_can_learn_from_all_others() ->
 @pytest.mark.parametrize(
     ("network", "message"),
     [
-        ({"initial_action": "plan.actio"}, "initial_action = plan.actio: unknown feature 'plan.actio'; did you mean"),
         ({"initial_action": "own.speed"}, "initial_action = own.speed: must be one feature with scale 1 and a range"),
-        ({"initial_action": "plan"}, "initial_action = plan: must be one feature with scale 1 and a range inside"),
-        ({"initial_action": -1.5}, "initial_action = -1.5: must be greater than or equal to -1"),
         ({"activation": "tanh"}, "activation = tanh: must be relu for the network to begin as plan.action"),
         ({"policy": [8, 1]}, "policy = [8, 1]: needs 2 units in every layer for the network to begin as plan.action"),
     ],
@@ -116,15 +104,6 @@ def test_first_action__is_given_by_one_key() -> None:
 def test_network__needs_the_feature_that_it_begins_as() -> None:
     with refused("recipe 'vine': the observation lacks the feature plan.action, which network.initial_action names"):
         new_model(PLAN.replace(observation=["own"]))
-
-
-def test_training__for_the_honest_count_selects_by_it(tmp_path: Path) -> None:
-    recipe = VINE.replace(reward={"harm": 1.0, "harm_count": "honest"})
-    trained = train(recipe, "paper-random", tmp_path / "run", on_progress=None)
-    course = [point["honest_cost"] for point in trained.evaluations]
-    assert len(course) > 1 and trained.metrics["honest_cost"] == min(course) > trained.metrics["total_harm"]
-    driven = eb.evaluate("paper-random", trained.agent, episodes=10, seed=7)[trained.agent]["honest_cost"]
-    assert driven.mean() == pytest.approx(trained.metrics["honest_cost"], abs=1e-3)
 
 
 def test_wider_policy__keeps_the_weights_of_its_features_in_their_new_places() -> None:

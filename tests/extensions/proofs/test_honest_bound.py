@@ -220,7 +220,7 @@ def test_bound__of_a_plan_that_an_attacker_found():
     assert bound > 36.0
 
 
-@pytest.mark.parametrize("cost", [1e-3, 4.0, 30.25, 30.26, 900.0])
+@pytest.mark.parametrize("cost", [1e-3, 30.25, 900.0])
 def test_most_push__is_the_inverse_of_the_price(cost):
     world = at(BOUNCE=0.1)
     for touch, closing in ((False, 1.0), (True, 0.5 * TOUCH_MPS)):
@@ -243,7 +243,7 @@ def test_bound__no_plan_is_below_it_in_random_worlds(size):
     state, best = random_runs(400 * size, rng)
     some = np.flatnonzero(avoidability(state).reason >= FRONT)
     state, best = state.take(some), best[some]
-    bound = lower_bound(state, count="honest", horizon_s=HORIZON_S, time_step_s=STEP_S).harm
+    bound = lower_bound(state, harm_count="honest", horizon_s=HORIZON_S, time_step_s=STEP_S).harm
     hardest, drive, each = state.braking_capacity_mps2[:, 1], state.driving_capacity_mps2[:, 1], np.arange(DECISIONS)
     least = chains_of(state, best)[2]
     for k in range(100):

@@ -9,14 +9,13 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import at_alert
-from ethbrake_marl.extensions.proofs import line as row
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, command_deviation
-from ethbrake_marl.extensions.proofs.flights import lead, widest_flight
+from ethbrake_marl.extensions.proofs.flights import widest_flight
 from ethbrake_marl.extensions.proofs.followers import after, after_rear, held_by_leader
 from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LARGE, REAR_FIRST
 from ethbrake_marl.extensions.proofs.lower_bound import front_first, lower_bound, rear_first, rounding
-from ethbrake_marl.extensions.proofs.meetings import gentlest, gentlest_front, meet_front, meet_rear
+from ethbrake_marl.extensions.proofs.meetings import gentlest_front
 from ethbrake_marl.motion.layout import FAR_M, HIT, SPEED
 from tests.extensions.proofs.worlds import at, opening, play, searched_harm, wide_worlds, worlds
 from tests.motion.lines import lines
@@ -31,11 +30,8 @@ def first_harm(state, switch, command):
 PAIR_BY_HAND = {
     "standing leader: 400 - 2 * 5 * 10": (worlds(10, [0, 20], [5, 5], drive=4), 2, 300),
     "both brake: 16 - 2 * 2 * 3": (worlds(3, [20, 24], [4, 6], drive=4), 2, 4),
-    "the leader brakes harder: 16 + 2 * 2 * 3": (worlds(3, [20, 24], [6, 4], drive=4), 2, 28),
     "the leader brakes harder and is faster: 2 * 2 * 1": (worlds(1, [20, 18], [6, 4], drive=4), 2, 4),
     "a touch": (worlds(4, [20, 24], [4, 6], drive=4), 2, 0),
-    "far away": (worlds(90, [20, 24], [4, 6], drive=4), 2, 0),
-    # 16 - 2 * (2 + 2) * gap
     **{f"drives away from {gap} m": (opening(gap), 1, harm) for gap, harm in ((1.5, 4), (2, 0), (3, 0))},
 }
 
@@ -146,53 +142,8 @@ def test_decisions__leave_less_room_and_no_plan_is_below():
 # What a first contact leaves, and what the command in force costs.
 
 
-def random_rows(n, seed):
-    """Rows in which Vehicle 2 brakes at least as hard as the others."""
-    rng, drawn = np.random.default_rng(seed), {}
-    for names, low, high in (
-        (("GAP_L", "GAP_R"), 1, 20), (("V_L", "V_F", "V_R"), 0, 32), (("A_L", "A_R", "U_F"), 2, 8),
-        (("LIMIT_F",), 32, 45), (("ONSET_R",), 0, 1.5), (("FRONT_SHARE", "REAR_SHARE"), 0.1, 0.9),
-        (("BOUNCE",), 0, 0.4),
-    ):  # fmt: skip
-        drawn |= {name: rng.uniform(low, high, n) for name in names}
-    drawn["A_F"] = np.maximum(drawn["A_L"], drawn["A_R"]) * rng.choice([1.0, 1.3], n)
-    return [at(**{name: column[k] for name, column in drawn.items()}) for k in range(n)]
-
-
 def follows(kind, values, time, closing):
     return after(kind, values, time, time, closing, time, 0.0)
-
-
-def test_gentlest_contact__is_reached_and_falls_with_the_time():
-    met = 0
-    for values in random_rows(60, seed=43):
-        for kind, meet in ((FRONT_FIRST, meet_front), (REAR_FIRST, meet_rear)):
-            coming = meet(values, np.inf if kind == FRONT_FIRST else 99.0)
-            times = np.array([meet(values, parameter) for parameter in np.linspace(0, 3, 13)])
-            times = np.sort(times[np.isfinite(times) & (times >= coming)])
-            softest = np.array([gentlest(kind, values, time) for time in times]).reshape(-1, 2)
-            met += times.size > 1
-            assert np.all(np.diff(softest[:, 0]) < 1e-5)
-            for time, (_, parameter) in zip(times, softest, strict=True):
-                if np.isfinite(parameter):
-                    assert meet(values, parameter) == pytest.approx(time, abs=1e-5)
-    assert met > 40
-
-
-def test_what_follows__falls_with_the_closing_speed_and_rises_with_the_time():
-    some = 0
-    for values in random_rows(80, seed=44):
-        apart, stand = values[row.GAP_L] + values[row.GAP_R], values[row.V_L] / values[row.A_L]
-        for kind in (FRONT_FIRST, REAR_FIRST):
-            times = [t for t in (0.1, 0.4, 0.8, 1.6) if row.leader(values, t)[1] - row.follower(values, t)[1] > -apart]
-            times = [t for t in times if kind == REAR_FIRST or t < stand]
-            if not times:
-                continue
-            harm = np.array([[follows(kind, values, t, w) for w in (0, 0.5, 1, 2, 4)] for t in times])
-            some += np.any(harm > 0)
-            assert np.all(np.diff(harm, axis=1) < 1e-7)
-            assert kind == REAR_FIRST or np.all(np.diff(harm, axis=0) > -1e-7)
-    assert some > 25
 
 
 # kind, gaps, speeds, rear vehicle's latency, command, first-impact harm of both pairs
@@ -269,17 +220,6 @@ def test_command_in_force__the_way_to_a_gentle_contact_is_the_wrong_one_after_it
     assert lack == pytest.approx([8 - (1 + steep) / (1 + 0.5 * steep), 8, 0])
 
 
-@pytest.mark.parametrize(("share", "press", "reach"), [(0.2, 13, 14), (0.45, 13, 14), (0.55, 13, 14), (0.78, 13, 9)])
-def test_lead__is_what_a_flight_gains_less_the_command_it_costs(share, press, reach):
-    # Every flight, tried: brake for s, then drive until the partner is met again. The last one brakes less than it.
-    opens, s = 0.3, np.linspace(0.0, 0.5, 501)
-    gap, relative = opens * s + 0.5 * (reach - press) * s * s, -(opens + (reach - press) * s)
-    met = (-relative + np.sqrt(relative**2 + 2 * press * np.maximum(gap, 0.0))) / press
-    best = np.max((share * (relative + press * met) - reach * s * (1.0 - share))[gap >= 0.0])
-    largest = lead((share, float(press), float(reach), 0.0), opens, 0.0, 50.0, 0.0)
-    assert largest >= best - 1e-9 and largest == pytest.approx(best, abs=2e-3)
-
-
 # One stands 5 m ahead, the other comes from 100 m behind; 60 m ahead it may come in time.
 BEFORE = dict(V_L=0, A_L=5, V_F=20, LIMIT_F=40, GAP_R=100, A_R=4)
 
@@ -327,8 +267,9 @@ def test_horizon__what_comes_later_does_not_count():
     assert np.all(near <= usual) and near.mean() < 0.5 * usual.mean()
 
 
-@pytest.mark.parametrize("time_step_s", [None, 0.1])
-@pytest.mark.parametrize(("mass", "bounce", "drive"), [(1.0, 0.0, 3.0), ([4.5, 5.5, 5.9], 1.0, 0.0)])
+@pytest.mark.parametrize(
+    ("time_step_s", "mass", "bounce", "drive"), [(None, 1.0, 0.0, 3.0), (0.1, [4.5, 5.5, 5.9], 1.0, 0.0)]
+)
 def test_who_stands_at_the_leader__is_struck_together_with_it(time_step_s, mass, bounce, drive):
     """One impact of all three: the front pair closes at 0 in it, and no second one follows."""
     state = worlds([0, 20], [0, 0, 20], 6.0, drive=drive, mass=mass, restitution=bounce)
@@ -341,9 +282,7 @@ THREE = worlds([7, 7], [20, 18, 20], [6, 7, 6], [0, 0.5, 0.8])
 REFUSED = {
     "lower_bound: harm_count = 'worst': must be 'first', 'total' or 'honest'": dict(harm_count="worst"),
     "lower_bound: horizon_s = 0.2: must be a finite number of at least 0.5": dict(horizon_s=0.2),
-    "lower_bound: horizon_s = inf: must be a finite number of at least 0.5": dict(horizon_s=math.inf),
     "lower_bound: time_step_s = 0.0: must be a finite number of at least 0.001": dict(time_step_s=0.0),
-    "lower_bound: time_step_s = nan: must be a finite number of at least 0.001": dict(time_step_s=math.nan),
 }
 
 

@@ -119,13 +119,3 @@ def test_watch__is_refused(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> N
     Path("film.gif").write_text("precious")
     told = "film.gif: already exists; give another name, or pass force=True (--force) to overwrite the file"
     refuse("watch --agents full_brake --output film.gif", told)
-
-
-def test_watch__refuses_an_existing_film_before_it_draws_one(
-    ethbrake: Command, empty_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
-    monkeypatch.setitem(WRITERS, ".gif", lambda films: pytest.fail("drawn before it is refused"))
-    Path("watch.gif").write_text("precious")
-    answer = ethbrake("watch", "--agents", "full_brake")
-    assert answer.status == 2 and "watch.gif: already exists; give another name" in answer.err

@@ -92,7 +92,7 @@ def test_step_frames__show_an_impact_inside_a_step_from_its_moment_on() -> None:
     assert not flashes(coasting("rgb_array", 13).render())  # 0.3 s later
 
 
-@pytest.mark.parametrize("scenario", ["paper-random-obstacle", "paper-random-buildup"])
+@pytest.mark.parametrize("scenario", ["paper-random-obstacle"])
 def test_scene__has_the_places_of_the_physics(scenario: str) -> None:
     environment = EthBrakeParallelEnv(scenario, render_mode="rgb_array")
     environment.reset(seed=7)

@@ -166,21 +166,6 @@ def test_trainings__that_are_finished_count(tmp_path: Path) -> None:
     assert [row[0] for row in made.sheets[0].rows] == ["PPO", "SAC"]
 
 
-def test_trainings__share_three_returns_and_a_harm(tmp_path: Path) -> None:
-    settings, (ppo, _) = ReproductionSettings(tmp_path), learning.TRAINING_GROUPS[HIGH]
-    first, second, _ = learning.runs_of(tmp_path, HIGH, ppo)
-    for run in (first, second):
-        plant(run, 1.0)
-    file = second / "progress.csv"
-    heading, *rows = file.read_text().splitlines()
-    file.write_text("\n".join([heading, *rows[:2], rows[3]]))
-    assert learning.courses_of(settings, HIGH)["PPO"].values.shape == (2, 3)
-    for damaged in ([], rows[:2], [row.rpartition(",")[0] + "," for row in rows]):  # the last has no harm
-        file.write_text("\n".join([heading, *damaged]))
-        with refused("progress.csv of ppo-paper-seed0, ppo-paper-seed1 share too few steps for a learning curve"):
-            learning.courses_of(settings, HIGH)
-
-
 def test_trainings__of_another_plan_are_refused(tmp_path: Path) -> None:
     settings, (ppo, _) = ReproductionSettings(tmp_path), learning.TRAINING_GROUPS[HIGH]
     run = learning.runs_of(tmp_path, HIGH, ppo)[1]

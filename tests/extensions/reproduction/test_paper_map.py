@@ -48,9 +48,10 @@ def test_impacts__of_one_sample_go_from_the_rear_to_the_front() -> None:
 
 @pytest.mark.parametrize(
     ("step_s", "agent", "harm"),
-    [(0.1, "full_brake", 23.479299909088144), (0.2, "full_brake", 29.585014941952608),
-     (0.25, "full_brake", 36.812182133604814), (0.5, "full_brake", 35.79459513033634),
-     (0.1, "constant:5", 27.97726529370422)],
+    [
+        (0.1, "full_brake", 23.479299909088144), (0.25, "full_brake", 36.812182133604814),
+        (0.1, "constant:5", 27.97726529370422),
+    ],
 )  # fmt: skip
 def test_game__has_the_figures_of_version_0_5(step_s: float, agent: str, harm: float) -> None:
     result = eb.evaluate(MAPPED.replace(time_step_s=step_s), agent, episodes=2_000, harm_count="first")
@@ -68,42 +69,6 @@ def test_game__world_does_not_depend_on_the_others_and_its_end_stays() -> None:
         assert all(np.array_equal(states[0].line[k], states[k + 1].line[0]) for k in range(3))
     assert before.ended.all() and np.array_equal(before.line, states[0].line)
     assert before.time_s.max() <= 8.1
-
-
-def by_hand(start: eb.State, actions: np.ndarray) -> tuple[list[float], list[float], float]:
-    """Drive one world from its first decision, with places in place of gaps: gaps, speeds, total harm at the end."""
-    h, mass, capacity = 0.1, start.mass_t[0].tolist(), start.braking_capacity_mps2[0].tolist()
-    places, speeds, harm = [0.0, *(-np.cumsum(start.gaps_m[0])).tolist()], start.speeds_mps[0].tolist(), 0.0
-    for n, action in enumerate(actions):
-        if 0.5 + n * h > 8.0 - 1e-9 or not any(speeds):
-            break
-        for front, rear in ((1, 2), (0, 1)):
-            closing = speeds[rear] - speeds[front]
-            if places[front] <= places[rear] and closing > 0.0:
-                harm += closing * closing
-                speeds[front] += mass[rear] * 1.1 * closing / (mass[front] + mass[rear])
-                speeds[rear] -= mass[front] * 1.1 * closing / (mass[front] + mass[rear])
-        for i, command in enumerate((-1.0, action, -1.0 if 0.5 + n * h > 0.8 - 1e-9 else 0.0)):
-            before, change = speeds[i], h * command * capacity[i]
-            speeds[i] = max(before + change, 0.0)
-            if before < 0.0:  # brakes act against the motion
-                speeds[i] = min(before - change, 0.0) if change < 0.0 else before + change
-            places[i] += h * (before + speeds[i]) / 2.0
-    return [places[0] - places[1], places[1] - places[2]], speeds, harm
-
-
-def test_game__is_that_of_a_slow_reference() -> None:
-    _, game = eb.open_game(MAPPED, reward="harm")
-    state = start = game.reset(MAPPED.sample(60, 7))
-    actions = np.random.default_rng(7).uniform(-1.0, 1.0, (75, 60, 1))
-    for each in actions:
-        state, _ = game.step(state, each)
-    assert state.ended.all() and state.collided.mean() > 0.5 and (state.gaps_m < 0.0).any()
-    for k in range(60):
-        gaps, speeds, harm = by_hand(start.take([k]), actions[:, k, 0])
-        assert state.gaps_m[k] == pytest.approx(gaps, abs=1e-9)
-        assert state.speeds_mps[k] == pytest.approx(speeds, abs=1e-9)
-        assert state.harm("total")[k] == pytest.approx(harm, abs=1e-9)
 
 
 def test_step__reports_and_rewards_what_happens() -> None:
@@ -175,7 +140,7 @@ def test_early_impacts__are_refused() -> None:
         eb.evaluate(early, "full_brake", episodes=3, harm_count="first")
 
 
-@pytest.mark.parametrize("agent", ["e_v2x_bm", "ppo+episode", "ppo+step", "best_harm", "universal"])
+@pytest.mark.parametrize("agent", ["ppo+step", "best_harm", "universal"])
 def test_agents__that_plan_with_exact_impacts_are_refused(agent: str) -> None:
     with refused("does not cover map, by which world 0 departs from the plain game"):
         eb.evaluate(MAPPED, agent, episodes=3, harm_count="first")
@@ -188,10 +153,7 @@ def test_agents__that_drive_here() -> None:
     assert result["ppo"]["total_harm"].mean() < result["full_brake"]["total_harm"].mean()
 
 
-MEASURES = (
-    *("pushed_mps", "pushed_m", "push", "drove", "collision", "drove_towards", "injury_gidas"),
-    *("proven_harm", "avoidable", "limits"),
-)
+MEASURES = ("pushed_m", "drove", "injury_gidas", "limits")
 
 
 @pytest.mark.parametrize("measure", MEASURES)
@@ -200,19 +162,10 @@ def test_measures__of_exact_impacts_are_refused(measure: str) -> None:
         eb.evaluate(MAPPED, "full_brake", episodes=3, measures=measure, harm_count="first")
 
 
-def test_results__have_no_honest_cost() -> None:
-    columns = eb.evaluate(MAPPED, "full_brake", episodes=5, harm_count="first")["full_brake"]
-    assert "total_harm" in columns and not any(name.startswith("honest_cost") for name in columns)
-
-
 @pytest.mark.parametrize(
     ("reward", "message"),
     [
-        (
-            "shaped",
-            "harm_count honest needs exact impacts, and physics: paper-map has none; write harm_count first",
-        ),
-        ("honest", "harm_count honest needs exact impacts"),
+        ("shaped", "harm_count honest needs exact impacts, and physics: paper-map has none; write harm_count first"),
         ({"harm": 1.0, "push": 1.0}, "the term push needs exact"),
     ],
 )
@@ -246,12 +199,6 @@ def test_honest_cost__of_exact_impacts_is_missing() -> None:
     for refusing in (MAPPED.sample(1, 7).harm, MAPPED.sample(1, 7).pair_harm, MAPPED.sample(1, 7).borne_harm):
         with refused("the honest cost does not cover map"):
             refusing("honest")
-
-
-def test_pictures__of_motion_between_samples_are_refused() -> None:
-    env = eb.EthBrakeEnv(MAPPED, render_mode="ansi", reward="harm")
-    with refused("a picture does not cover map"):
-        env.reset(seed=7)
 
 
 def test_worlds__of_another_scenario_depart_by_the_map_or_are_refused() -> None:

@@ -82,7 +82,6 @@ class World:
     ("changes", "bias"),
     [
         ({}, -0.8),
-        ({"time_step_s": 0.2, "restitution": 0.0}, 0.0),
         ({"time_step_s": 0.25, "restitution": 0.5, "latency_s": [0, 0.37, 0.71]}, 0.0),
         ({"mass_t": [12.0, 1.0, 3.3], "restitution": 0.3}, 0.0),  # some vehicles are thrown backwards
         ({"mass_t": [1.0, 3.0, 30.0], "speed_limit_mps": 22}, 0.0),  # or above the limit

@@ -34,29 +34,21 @@ DRIVEN_EARLY = register.EARLY_DRIVEN
 ROWS = {
     "stated": STATED,
     "early": EARLY,
-    "rear": STATED._replace(rear_s=0.95),
     "map": STATED._replace(step_s=0.25),
-    "plastic": STATED._replace(restitution=0.0),
     "coasts": STATED._replace(after_impact="coasts"),
     "ends": STATED._replace(after_impact="ends"),
-    "coasts in the map": STATED._replace(after_impact="coasts", step_s=0.2),
     "planned": DRIVEN_EARLY._replace(star="low end"),
     "total": STATED._replace(counted="total", hybrid="realised, by the coupled H*"),
-    "predicted": STATED._replace(baseline="predicted", hybrid="predicted"),
     "nearest": NEAREST,
 }
 GOLDEN = {  # in the first 100 worlds: collision rate and mean harm of Non-E, E-V2X-BM, Hybrid SAC, Hybrid PPO
     "stated": [0.8, 21.011164, 0.6, 17.195163, 0.6, 7.068346, 0.6, 6.934062],
     "early": [0.96, 31.741475, 0.49, 16.739087, 0.49, 3.928278, 0.49, 3.463971],
-    "rear": [0.94, 31.125701, 0.75, 24.794984, 0.74, 9.486244, 0.74, 9.289192],
     "map": [0.96, 34.530865, 0.91, 28.875307, 0.79, 20.510552, 0.77, 22.396755],
-    "plastic": [0.8, 20.655952, 0.6, 16.679115, 0.6, 6.880712, 0.6, 6.794417],
     "coasts": [0.8, 33.539506, 0.6, 17.195163, 0.6, 7.068346, 0.6, 6.934062],
     "ends": [0.8, 13.001568, 0.6, 17.195163, 0.6, 7.068346, 0.6, 6.934062],
-    "coasts in the map": [0.9, 40.473706, 0.77, 21.57445, 0.71, 13.036153, 0.68, 13.529591],
     "planned": [0.96, 31.741475, 0.84, 8.559601, 0.49, 3.628675, 0.49, 3.477837],
     "total": [0.8, 22.464132, 0.6, 18.491603, 0.6, 6.468591, 0.6, 6.310893],
-    "predicted": [0.8, 21.011164, 0.6, 8.559601, 0.6, 6.182318, 0.6, 6.055781],
     "nearest": [0.96, 31.966079, 0.83, 8.559601, 0.54, 5.251315, 0.49, 4.982125],
 }
 
@@ -69,7 +61,6 @@ def test_numbers__are_as_recorded(name: str) -> None:
 @pytest.mark.parametrize(
     ("reading", "spec"),
     [
-        (STATED, "ppo+episode:pairwise"),
         (EARLY._replace(hybrid="realised, by the coupled H*"), "ppo+episode"),
         (STATED._replace(hybrid="policy alone", step_s=0.2), "ppo"),
         (STATED._replace(hybrid="realised, by the coupled H*", counted="total"), "ppo+episode"),
@@ -84,7 +75,7 @@ def test_hybrid__is_what_the_shield_does(reading: Reading, spec: str) -> None:
     assert np.array_equal(harm, shield[column]) and np.array_equal(collided, shield["collided"])
 
 
-@pytest.mark.parametrize("reading", [STATED, STATED._replace(step_s=0.2), EARLY], ids=lambda reading: reading.name)
+@pytest.mark.parametrize("reading", [STATED._replace(step_s=0.2), EARLY], ids=lambda reading: reading.name)
 def test_baselines__are_what_the_agents_do(reading: Reading) -> None:
     result = eb.evaluate(reading.scenario(RANDOM), "full_brake,e_v2x_bm:pairwise", episodes=WORLDS)
     for row, name in ((NON_E, "full_brake"), (E_V2X_BM, "e_v2x_bm:pairwise")):

@@ -140,7 +140,6 @@ DAMAGED: dict[str, Callable[[BestHarmTable], bytes]] = {
     "first_ends: must not decrease within a world": changed(first_ends=lambda ends: ends[:, ::-1]),
     "total_ends: must not decrease within a world, and end above 0": changed(total_ends=np.zeros_like),
     "array 'total_commands': must not be in this file": changed(total_harm=lambda harm: None),
-    "array 'first_ends': is missing": changed(first_ends=lambda ends: None),
     "array 'identity': has type int32": changed(identity=lambda identity: identity.astype(np.int32)),
     "is not a table of best known harm": lambda table: table.content()[:-40],
 }
