@@ -23,6 +23,7 @@ class Chains(NamedTuple):
     vehicles: list[str]  # the vehicles of each chain, such as ``2-3-4``
     longest: int  # number of vehicles in the longest queue
     left_out: Counter[str]  # description of data that were left out -> their number
+    interpolated: int  # number of states between two rows of a vehicle
 
 
 def cut_chains(recording: Recording, vehicles: int) -> Chains:
@@ -56,7 +57,8 @@ def cut_chains(recording: Recording, vehicles: int) -> Chains:
     numbers = np.column_stack([gaps[members[:, 1:]], states["speed"].to_numpy()[members]])
     name_of = {number: recording.name(number) for number in states["vehicle"].unique()}
     names = states["vehicle"].map(name_of).to_numpy()[members]
-    return Chains(numbers, ["-".join(chain_names) for chain_names in names], longest, left_out)
+    chain_names = ["-".join(of_chain) for of_chain in names]
+    return Chains(numbers, chain_names, longest, left_out, recording.interpolated)
 
 
 def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
@@ -65,10 +67,16 @@ def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
 
     Of several followers of one vehicle, only the nearest is kept. ``left_out`` counts the others.
     """
-    entry = recording.entry
+    entry, unread = recording.entry, recording.unread
     if entry.by_lane:
-        ordered = states.sort_values(["moment", "lane", "front"], ascending=[True, True, False], kind="stable")
+        on_road = pd.concat([states, unread], ignore_index=True)
+        ordered = on_road.sort_values(["moment", "lane", "front"], ascending=[True, True, False], kind="stable")
         states["ahead"] = ordered.groupby(["moment", "lane"])["vehicle"].shift(1).fillna(-1.0)
+    is_unread = pd.MultiIndex.from_frame(states[["moment", "ahead"]]).isin(
+        pd.MultiIndex.from_frame(unread[["moment", "vehicle"]])
+    )
+    left_out["links to a vehicle that has no row near this time"] += int(is_unread.sum())
+    states.loc[is_unread, "ahead"] = -1.0
     ahead_states = states[["moment", "vehicle", "lane", "front", "side", "dx", "dy", "length", "speed"]]
     ahead_states = ahead_states.add_suffix("_ahead").assign(front_car=states.index)
     pairs = states.merge(ahead_states, "left", left_on=["moment", "ahead"], right_on=["moment_ahead", "vehicle_ahead"])

@@ -26,6 +26,7 @@ from ethbrake_marl.worlds.scenario_file import check_file_name
 
 with naming_extras():
     from ethbrake_marl.extensions.recorded.chains import cut_chains
+    from ethbrake_marl.extensions.recorded.interpolation import NEAR_S
     from ethbrake_marl.extensions.recorded.reading import LARGEST_BYTES, NotARecording
     from ethbrake_marl.extensions.recorded.states import read_recording
 
@@ -38,6 +39,7 @@ class ChainRows(NamedTuple):
     of: list[tuple[str, str]]  # recording and vehicles of each row
     seen: int  # number of chains in the recordings; there can be fewer rows
     left_out: Counter[str]  # description of data that were left out -> their number
+    interpolated: int  # number of states between two rows of a vehicle
     refused: list[str]  # error message for each refused file
     skipped: list[str]  # names of files that are not recordings, or repeat another file
 
@@ -52,6 +54,9 @@ class ChainRows(NamedTuple):
             " at most one chain",
             f"rows of {count_of(len(set(self.of)), f'different {groups}')} of vehicles in {self.recordings}",
         ]
+        if self.interpolated:
+            states = count_of(self.interpolated, "vehicle")
+            parts.append(f"interpolated: {states} between two rows at most {NEAR_S:g} s apart")
         parts += [f"left out: {number:,} {what}" for what, number in sorted(self.left_out.items()) if number]
         if self.skipped:
             more = f" and {len(self.skipped) - MOST_LISTED:,} more" if len(self.skipped) > MOST_LISTED else ""
@@ -131,7 +136,7 @@ def read_chains(
     A file with an error is refused as a whole; a copy of another file is skipped. Raises ``InvalidInput`` if there is
     no recording of the format, or no chain.
     """
-    longest, left_out, refused, skipped = 0, Counter[str](), list[str](), list[str]()
+    longest, states_between, left_out, refused, skipped = 0, 0, Counter[str](), list[str](), list[str]()
     numbers, of, digests, format_errors = (
         [np.empty((0, 2 * vehicles - 1))],
         list[tuple[str, str]](),
@@ -162,6 +167,7 @@ def read_chains(
             numbers.append(chains.numbers)
             of += [(printable_name, chain) for chain in chains.vehicles]
             left_out.update(chains.left_out)
+            states_between += chains.interpolated
             longest = max(longest, chains.longest)
     if refused and not of:
         raise InvalidInput(f"{folder}: {count_of(len(refused), 'file')} refused: {'; '.join(refused)}")
@@ -180,7 +186,7 @@ def read_chains(
     thinned = f"chains: a table has at most {MOST_NUMBERS:,} numbers, so one in {each_of} is used"
     left_out[thinned] = len(of) - len(chosen)
     rows = np.array([[round(number, 3) + 0.0 for number in row] for row in np.concatenate(numbers)[chosen].tolist()])
-    return ChainRows(rows, [of[k] for k in chosen], len(of), left_out, refused, skipped)
+    return ChainRows(rows, [of[k] for k in chosen], len(of), left_out, states_between, refused, skipped)
 
 
 def files_of(folder: Path, entry: Format, refused: list[str]) -> dict[str, Path]:

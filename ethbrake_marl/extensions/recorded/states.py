@@ -10,8 +10,9 @@ import pandas as pd
 
 from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.extensions.recorded.formats import HIGHD_META, Format
+from ethbrake_marl.extensions.recorded.interpolation import Between, interpolated, rows_between
 from ethbrake_marl.extensions.recorded.reading import Cells, read_cells
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.worlds.quantities import QUANTITIES
 
 FASTEST_MPS, LONGEST_M = 75.0, 40.0  # largest speed (270 km/h) and length of a road vehicle
@@ -40,6 +41,8 @@ class Recording(NamedTuple):
     entry: Format
     states: Any
     names: dict[float, str]  # number of a vehicle or lane -> its name, if files have names instead of numbers
+    interpolated: int  # number of states between two rows of the vehicle
+    unread: Any  # further vehicles on the road, without a row near the moment; same columns as ``states``
 
     def name(self, number: float) -> str:
         return self.names.get(number) or f"{number:.0f}"
@@ -56,8 +59,12 @@ def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
     if raw.empty:
         right = f" except those from {' and '.join(entry.streets)}, which have crossings" * bool(entry.streets)
         raise InvalidInput(f"{file}: contains no rows of data{right}")
-    moment = moments(raw["time"].to_numpy() / entry.per_second, every_s)
-    raw = raw.assign(moment=moment)[moment >= 0.0]
+    vehicle = np.zeros(len(raw), np.int64) if entry.gaps else pd.factorize(raw["vehicle"])[0]
+    moment, between = moments(raw["time"].to_numpy() / entry.per_second, vehicle, every_s)
+    places = raw.index
+    is_used = moment >= 0.0
+    is_used[between.before] = is_used[between.after] = True
+    raw = raw.assign(moment=moment)[is_used]
     if entry.gaps:
         states = _openacc(raw, cells, entry)
     else:
@@ -70,20 +77,28 @@ def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
             _turn_exid(states, raw)
         _check(states, cells, entry)
     states["row"] = states.index
-    recording = Recording(cells, entry, states.sort_values(list(states), ignore_index=True), names)
+    between = between._replace(before=places[between.before], after=places[between.after])
+    more, unread = interpolated(states, between)
+    states = pd.concat([states[states["moment"] >= 0.0], more])
+    states = states.sort_values(list(states), ignore_index=True)
+    recording = Recording(cells, entry, states, names, len(more), unread)
     if not entry.gaps:
         _check_positions(recording, every_s)
     return recording
 
 
-def moments(times_s: Floats, every_s: float) -> Floats:
-    """Number of the moment for which each recorded time is used, [rows] floats; -1: not used.
+def moments(times_s: Floats, vehicle: Ints, every_s: float) -> tuple[Floats, Between]:
+    """Number of the moment for which each row is used, [rows] floats, -1: not used; and vehicles without such a row.
 
     Moment k, ``min(times_s) + k every_s``, uses the nearest recorded time, at most half a recording step (the smallest
-    difference between recorded times) away. Raises ``InvalidInput`` if ``every_s`` is less than this step.
+    difference between recorded times of a vehicle) away. Raises ``InvalidInput`` if ``every_s`` is less than this step.
     """
     recorded, back = np.unique(np.round(times_s - times_s.min(), 6), return_inverse=True)
-    step = np.diff(recorded).min(initial=every_s if len(recorded) == 1 else np.inf)
+    order = np.lexsort((back, vehicle))
+    steps = np.diff(recorded[back[order]])[np.diff(vehicle[order]) == 0]
+    step = steps[steps > 0.0].min(initial=np.inf)
+    if step == np.inf:  # no vehicle is recorded twice
+        step = np.diff(recorded).min(initial=every_s)
     if every_s < 0.99 * step:
         raise InvalidInput(
             f"every = {every_s:g} s: the time between the moments that are read must be at least {step:g} s, the time"
@@ -96,7 +111,7 @@ def moments(times_s: Floats, every_s: float) -> Floats:
     nearest = nearest[off[nearest] <= 0.51 * step]
     out = np.full(len(recorded), -1.0)
     out[nearest] = number[nearest]
-    return np.asarray(out[back])
+    return np.asarray(out[back]), rows_between(recorded, back, vehicle, number[nearest], nearest, float(step))
 
 
 def _number_names(raw: Any, cells: Cells) -> dict[float, str]:
