@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,14 +23,14 @@ from ethbrake_marl.agents.foreign import (
 )
 from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
 from ethbrake_marl.episode.counts import COUNTS, HarmCount
-from ethbrake_marl.episode.features import GROUPS
+from ethbrake_marl.episode.features import GROUPS, group_named
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import NUMBER, State, map_arrays
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.motion.digest import physics_digest
-from ethbrake_marl.motion.layout import Floats, Ints
+from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.policies.manifest import PHYSICS_KEY
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.training_range import TrainingRange
@@ -95,17 +96,25 @@ class LearnedAgent(RangeObserver):
         return None if self.training_range is None else RangeMemory(np.zeros(alert.n, np.int64))
 
     def act(self, state: State, memory: RangeMemory | None, body: int) -> tuple[Floats, RangeMemory | None]:
-        observations = self.observe(self.policy.observation, state, body)
+        fallback = "" if self.training_range is None else self.training_range.fallback
+        observations, is_known = self._observe_with_fallback(fallback, state, body)
         actions = self.policy(observations)[:, 0].astype(np.float64)
         if self.training_range is not None:
-            outside, fallback = (
-                self.training_range.is_outside(observations) & ~state.ended,
-                self.training_range.fallback,
-            )
+            outside = (self.training_range.is_outside(observations) | ~is_known) & ~state.ended
             if fallback and outside.any():
                 actions[outside] = self.observe(View([fallback]), state.take(outside), body)[:, 0]
             memory = None if memory is None else RangeMemory(memory.outside + outside)
         return commands_of(state, body, actions), memory
+
+    def _observe_with_fallback(self, fallback: str, state: State, body: int) -> tuple[Observations, Bools]:
+        """Observations, [n, F], and whether the group of the feature ``fallback`` is known, [n].
+
+        Where it is not, the policy would act on a forecast that lacks a neighbour.
+        """
+        view, column = with_known(self.policy.observation, fallback)
+        observations = self.observe(view, state, body)
+        is_known = np.ones(state.n, np.bool_) if column is None else observations[:, column] > 0.0
+        return np.ascontiguousarray(observations[:, : len(self.policy.observation.names)]), is_known
 
     @property
     def training_range(self) -> TrainingRange | None:
@@ -120,6 +129,16 @@ class LearnedAgent(RangeObserver):
 
     def observe(self, view: View, state: State, body: int) -> Observations:
         return observe_through(self.layers, view, state, body, self.policy.manifest.time_step_s)
+
+
+@cache
+def with_known(view: View, fallback: str) -> tuple[View, int | None]:
+    """``view`` and the feature ``known`` of the group of ``fallback``, and the column of this feature; None: none."""
+    group = fallback.partition(".")[0]
+    if "known" not in [feature.name for feature in group_named(group) or ()]:
+        return view, None
+    names = list(dict.fromkeys([*view.names, f"{group}.known"]))
+    return View(names), names.index(f"{group}.known")
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from ethbrake_marl.episode.features import (
     side_of,
 )
 from ethbrake_marl.episode.functions import call_function, check_finite_values
+from ethbrake_marl.episode.reach import row_within_reach, within_reach
 from ethbrake_marl.episode.state import TIME, State
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacity
@@ -146,10 +147,14 @@ class View:
 
 
 def knows(state: State, body: int, neighbour: int) -> NDArray[np.bool_]:
-    """Whether ``body`` already knows ``neighbour`` and may react to it, [n]; False if there is no such vehicle."""
+    """Whether ``body`` already knows ``neighbour`` and may react to it, [n].
+
+    False if there is no such vehicle, or if it cannot matter (``episode.reach``).
+    """
     if not 0 < neighbour <= state.vehicles:
         return np.zeros(state.n, np.bool_)
-    return np.asarray(state.time_s >= state.know[:, body, neighbour])
+    first, last = within_reach(state, body).T
+    return np.asarray((first <= neighbour) & (neighbour <= last) & (state.time_s >= state.know[:, body, neighbour]))
 
 
 def has_unknown(state: State, body: int) -> NDArray[np.bool_]:
@@ -232,11 +237,11 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, p
 @kernel
 def write_observations(line, car, clock, know, observers, offsets, role, obstacle, places, scaling, value, out):
     """Write features as ``observe_worlds`` does."""
-    bodies = line.shape[2]
     for k in range(len(out)):
         w, c, time = line[k], car[k], clock[k, TIME]
         for o in range(len(observers)):
             i = observers[o]
+            first, last = row_within_reach(w, c, clock[k], know[k], i)
             latency_left = max(c[OWN_LATENCY, i] - time, 0.0)
             own_stop = full_stop_m(w[SPEED, i], latency_left, capacity(c, BRAKING, i))
             value[OWN_SPEED], value[OWN_ACCELERATION], value[OWN_MASS] = w[SPEED, i], w[FORCE, i], c[MASS, i]
@@ -247,7 +252,7 @@ def write_observations(line, car, clock, know, observers, offsets, role, obstacl
                 j = i + offset
                 near = value[f : f + N_NEIGHBOUR]
                 near[:] = 0.0
-                if 0 < j < bodies and time >= know[k, i, j]:
+                if first <= j <= last and time >= know[k, i, j]:
                     gap, front = 0.0, j < i
                     for p in range(min(i, j), max(i, j)):
                         gap += w[GAP, p]
@@ -263,12 +268,12 @@ def write_observations(line, car, clock, know, observers, offsets, role, obstacl
                     near[NEAR_FITTING_DECELERATION] = fitting_deceleration(w[SPEED, i], latency_left, room)
                 f += N_NEIGHBOUR
             if role:
-                value[f + ROLE_AHEAD], value[f + ROLE_BEHIND] = i - 1, bodies - 1 - i
+                value[f + ROLE_AHEAD], value[f + ROLE_BEHIND] = i - first, last - i
                 f += N_ROLE
             if obstacle:
                 ahead = value[f : f + N_OBSTACLE]
                 ahead[:] = 0.0
-                if w[GAP, 0] < FAR_M and (i == 1 or time >= know[k, i, 1]):
+                if w[GAP, 0] < FAR_M and first == 1 and (i == 1 or time >= know[k, i, 1]):
                     gap = 0.0
                     for p in range(i):
                         gap += w[GAP, p]

@@ -1,7 +1,9 @@
 """The feature groups ``contact`` and ``contact_far``: a vehicle's next impacts if it brakes, coasts or drives fully.
 
-A forecast simulates, for ``FORECAST_S``, the unbroken row of known vehicles around the observer. The observer's command
-takes effect after its latency. Every other vehicle keeps the present force of its brakes or engine, with two
+A forecast simulates, for ``FORECAST_S``, the unbroken row of known vehicles around the observer, without those that
+cannot matter (``episode.reach``). There is no forecast for an observer that cannot predict a neighbour of which it
+knows (its own ``know`` is then infinite): it reads as if nobody were known. The observer's command takes effect after
+its latency. Every other vehicle keeps the present force of its brakes or engine, with two
 exceptions: a vehicle without a force brakes fully after its latency, and a vehicle whose brakes build up is taken to
 brake fully, since its force does not show its command.
 """
@@ -15,6 +17,7 @@ import numpy as np
 from ethbrake_marl.episode.commands import command_of
 from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.features import Feature
+from ethbrake_marl.episode.reach import row_within_reach
 from ethbrake_marl.episode.state import TIME, State, require
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
@@ -88,17 +91,18 @@ CONTACT_FAR = tuple(feature for command, held in FORECAST_COMMANDS.items() for f
 
 
 @kernel
-def known_line(line, car, know, time, i, observer_line, parameters, commands):
+def known_line(line, car, clock, know, i, observer_line, parameters, commands):
     """Copy a world as body i knows it, with assumed commands of the others; return the first and last known body.
 
-    ``line``, ``car`` and ``know`` of the world at ``time`` (s), as in ``State``, are copied to ``observer_line`` and
+    ``line`` and ``car`` of the world, as ``clock`` and ``know`` in ``State``, are copied to ``observer_line`` and
     ``parameters``. The assumed commands (m/s2) are written to ``commands`` [N + 1]. Unknown bodies are at rest and out
     of reach.
     """
-    first, last = i, i
-    while first > 1 and time >= know[i, first - 1]:
+    first, last, time, predicts = i, i, clock[TIME], know[i, i] < math.inf
+    nearest, farthest = row_within_reach(line, car, clock, know, i)
+    while predicts and first > nearest and time >= know[i, first - 1]:
         first -= 1
-    while last < line.shape[1] - 1 and time >= know[i, last + 1]:
+    while predicts and last < farthest and time >= know[i, last + 1]:
         last += 1
     for j in range(line.shape[1]):
         for row in range(CAR_ROWS):
@@ -114,7 +118,7 @@ def known_line(line, car, know, time, i, observer_line, parameters, commands):
             commands[j] = -capacity(car, BRAKING, j) if inside else 0.0
         elif inside and force < 0.0 and car[BRAKE_RATE, j] < math.inf:
             commands[j] = -capacity(car, BRAKING, j)
-    if first == 1 and line[GAP, 0] < FAR_M:
+    if predicts and first == 1 and line[GAP, 0] < FAR_M:
         observer_line[GAP, 0], first = line[GAP, 0], 0
     return first, last
 
@@ -131,7 +135,7 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
     for k in range(len(out)):
         for o in range(len(observers)):
             i = observers[o]
-            first, last = known_line(line[k], car[k], know[k], clock[k, TIME], i, observer_line, parameters, commands)
+            first, last = known_line(line[k], car[k], clock[k], know[k], i, observer_line, parameters, commands)
             for c in range(3):
                 for row in range(LINE_ROWS):
                     for j in range(here.shape[1]):

@@ -2,10 +2,10 @@
 
 At every decision, nine constant brakings from full braking to coasting are simulated in the forecast of ``contacts``,
 and then nine between the neighbours of the best. The plan is the one of least honest cost of the known pairs; of equal
-ones, the middle one. The agent applies it until the next decision, and plans anew: receding-horizon control with
-constant commands. Its objective, the least impact energy of a line, is that of coordinated brake control (Lu, Wang, Li
-and Zheng, Mathematical Problems in Engineering 2014, article 192175; Wang, Li, Zheng and Lu, Integrated Computer-Aided
-Engineering 22, 2015, pages 171-185).
+ones, the middle one. If the forecast has nobody else, the plan is full braking. The agent applies it until the next
+decision, and plans anew: receding-horizon control with constant commands. Its objective, the least impact energy of a
+line, is that of coordinated brake control (Lu, Wang, Li and Zheng, Mathematical Problems in Engineering 2014, article
+192175; Wang, Li, Zheng and Lu, Integrated Computer-Aided Engineering 22, 2015, pages 171-185).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
 from ethbrake_marl.episode.observe import View
-from ethbrake_marl.episode.state import TIME, State, require
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.forecasts.contacts import (
@@ -70,6 +70,7 @@ PLAN = (
         for vehicle, whose in {"own": "this vehicle", **SIDES}.items()
         for change in ("build_up", "release")
     ),
+    Feature("known", "1", 1.0, 0.0, 1.0, "0 if a neighbour of which this vehicle knows cannot be predicted"),
 )
 
 
@@ -84,10 +85,9 @@ def plan_worlds(line, car, clock, know, observers, time_step_s, weights, memory,
     scratch, here, observer_line, parameters, commands, trials, costs = memory
     failed = -1
     for k in range(len(out)):
-        time = clock[k, TIME]
         for o in range(len(observers)):
             i, value = observers[o], out[k, o]
-            first, last = known_line(line[k], car[k], know[k], time, i, observer_line, parameters, commands)
+            first, last = known_line(line[k], car[k], clock[k], know[k], i, observer_line, parameters, commands)
             middle, spacing = -0.5, 1.0 / (TRIALS - 1)
             for level in range(LEVELS):
                 for c in range(TRIALS):
@@ -103,7 +103,7 @@ def plan_worlds(line, car, clock, know, observers, time_step_s, weights, memory,
                     write_impacts(scratch, outcome == EVENT_BY_EVENT, i, first, last, time_step_s, trials[c])
                     costs[c] = amount_so_far(here, weights)
                     trials[c, COST] = math.sqrt(costs[c])
-                best = middle_of_least(costs)
+                best = middle_of_least(costs) if first < last else 0
                 middle = min(max(middle + spacing * (best - TRIALS // 2), -1.0), 0.0)
                 spacing /= TRIALS // 2
                 for part in range(PER_COMMAND):
@@ -117,6 +117,7 @@ def plan_worlds(line, car, clock, know, observers, time_step_s, weights, memory,
                 for rate in (BRAKE_RATE, RELEASE_RATE):
                     value[f] = capacity(car[k], BRAKING, j) / car[k, rate, j] if is_known else 0.0
                     f += 1
+            value[f] = 1.0 if know[k, i, i] < math.inf else 0.0
     return failed
 
 

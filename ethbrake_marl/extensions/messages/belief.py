@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ethbrake_marl.episode.reach import within_reach
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.messages.links import (
@@ -98,14 +99,19 @@ def predictable_belief_of(state: State, observer: int) -> State:
     """State as the body ``observer`` estimates it, without the vehicles that it cannot predict.
 
     The observer can predict a vehicle of which it knows all quantities, except perhaps the intent. ``know`` is infinite
-    for all other bodies.
+    for all other bodies, and for those that cannot matter (``episode.reach``). If the observer knows something of a
+    neighbour that it cannot predict, it cannot predict itself either: then its own ``know`` is infinite, too.
     """
     known = known_pieces(state, observer)
-    line, predictable = (
-        estimated_line(state, observer, known, newest_samples(state, observer)),
-        known[:, :, :P_INTENT].all(axis=2),
-    )
-    return state._replace(line=line, know=_known_if(state, observer, np.asarray(predictable)))
+    line = estimated_line(state, observer, known, newest_samples(state, observer))
+    predictable: Bools = np.asarray(known[:, :, :P_INTENT].all(axis=2))
+    first, last = within_reach(belief_of(state, observer), observer).T[:, :, np.newaxis]
+    bodies = np.arange(known.shape[1])
+    matters = (bodies == 0) | ((first <= bodies) & (bodies <= last))
+    is_neighbour = np.abs(bodies - observer) == 1
+    unpredicted = known.any(axis=2) & ~predictable & matters & is_neighbour
+    predictable[unpredicted.any(axis=1), observer] = False
+    return state._replace(line=line, know=_known_if(state, observer, predictable & matters))
 
 
 def _known_if(state: State, observer: int, holds: Bools) -> Floats:
