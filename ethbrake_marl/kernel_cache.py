@@ -93,7 +93,7 @@ def delete_damaged() -> tuple[int, int]:
 def announce_compilation() -> None:
     """Print a line on stderr, once in this process, just before it first compiles."""
     what = "parts of the physics" if _stored_files() else "the physics for the first time, which takes a minute or more"
-    advice = "" if obstacle() else "; later processes use the stored result "
+    advice = "" if obstacle() else "; later processes use the stored result"
     with suppress(AttributeError, OSError, ValueError):  # there is no stderr
         sys.stderr.write(f"compiling {what}{advice}\n")
         sys.stderr.flush()

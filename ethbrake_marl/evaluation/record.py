@@ -147,11 +147,11 @@ def record_agents(
     if isinstance(worlds, State):
         if scenario is None:
             raise InvalidInput("record_episode: a world needs its scenario, for instance scenario='paper-random'")
-        world, (loaded, game) = worlds, open_game(scenario)
+        world, (loaded, game) = worlds, open_game(scenario, reward={"harm_count": count})
     else:
         if scenario is not None:
             raise InvalidInput("record_episode: scenario: is given twice; leave one of the two out")
-        loaded, game = open_game(worlds)
+        loaded, game = open_game(worlds, reward={"harm_count": count})
         world = loaded.sample(1, seed, first=number)
     require_learner(loaded)
     if world.n != 1 or world.time_s[0] != 0.0:

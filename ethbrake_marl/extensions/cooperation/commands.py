@@ -19,7 +19,7 @@ AFTER_STOPPED_STUDY = "the same command continues the work in this folder"
 study_group = typer.Typer(
     rich_markup_mode=None,
     add_completion=False,
-    help="Compare levels of cooperation, and choices of whose harm counts.",
+    help="Compare levels of cooperation, or whose harm counts.",
     epilog=example("study ablate --quick --output runs/ablation-quick", "study front --output runs/front"),
 )
 

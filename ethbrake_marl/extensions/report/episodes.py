@@ -177,7 +177,8 @@ def episodes_section(compared: Comparison, focus: str, kinds: dict[int, str]) ->
 
     A note names every agent whose harm now differs from its harm in the evaluation.
     """
-    rows, worlds, (_, game) = [*kinds], compared.worlds(kinds), open_game(compared.scenario)
+    rows, worlds = [*kinds], compared.worlds(kinds)
+    _, game = open_game(compared.scenario, reward={"harm_count": compared.harm_count})
     records = {agent: record_episodes(worlds, team, game, MOTION_SAMPLE_S) for agent, team in compared.teams.items()}
     moving = sum(not all(record.at_rest for record in world) for world in zip(*records.values(), strict=True))
     until = "from the alert until all vehicles are at rest"

@@ -146,7 +146,7 @@ def single_learner_game(scenario: Scenario, alert: State, body: int) -> tuple[Ga
                 " the alert; a search needs scripts that hold one command"
             )
     braking_learners = [learner for learner in scenario.learners if learner != body]
-    _, game = game_of(scenario.with_learners([scenario.vehicle_names[body - 1]]), {})
+    _, game = game_of(scenario.with_learners([scenario.vehicle_names[body - 1]]), {}, "harm")  # the reward is not used
     return game, with_braking(alert, braking_learners)
 
 

@@ -85,7 +85,7 @@ def test_sentences__are_judged_by_claims_that_the_code_makes_and_no_claim_is_lef
             module, "courses_of", lambda settings, delay: {"PPO": course} if delay == learning.DENSE else courses
         )
     for module in (curves, tables):
-        monkeypatch.setattr(module, "unconverged_policy", lambda folder: "vine-paper")
+        monkeypatch.setattr(module, "unconverged_policy", lambda folder: "sac")
     settings = ReproductionSettings(tmp_path, episodes=20)
     made = {f"{item.name}/{claim.name}" for item in ITEMS for claim in item.make(settings).claims}
     assert made == {sentence["result"] for sentence in SENTENCES}
