@@ -57,7 +57,7 @@ REFUSED = {
     "--sweep friction=0.5,0.50": "given twice",
     "--sweep gamma=0.9,0.99": "only a key of a scenario can be swept",
     "--sweep vehicles=2,3": "cannot be compared",
-    "--sweep friction=0.5,0.6 --sweep v2x.lost=0,0.1": "--sweep is given twice",
+    "--sweep friction=0.5,0.6 --sweep v2x.silent_links=0,0.1": "--sweep is given twice",
     "--sweep friction=0.5,0.6 --set friction=1": "--set changes the same key",
     "--sweep friction=0.5,0.6 --levels cooperation-3-pair,cooperation-4-all": "a sweep needs exactly one level",
     "--sweep objective=social:0,90 --set reward.objective=own": "has its own objective",
