@@ -76,7 +76,7 @@ def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str
     eb.register_feature_group("loads", [], lambda state, bodies, time_step_s: state.mass_t[:, bodies - 1, np.newaxis])
     eb.register_physics("icy", Icy())
     eb.register_v2x_key("fog_m", Fog())
-    eb.register_preset("deaf", {"preset": "nominal", "lost": 0.5})
+    eb.register_preset("deaf", {"preset": "nominal", "silent_links": 0.5})
     eb.register_objective("front", lambda harm, vehicle: harm.borne[:, 0])
     eb.register_measure("stopped_s", stopped_s, unit="s")
     driver: eb.Agent = eb.policy_agent(lambda seen: -abs(seen[:, :1]), name="mine", clip=True)

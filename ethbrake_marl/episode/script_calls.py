@@ -7,23 +7,45 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.episode.state import NUMBER, State, map_arrays
+from ethbrake_marl.episode.state import NUMBER, State, arrays_of, map_arrays
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, describe_error
 from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
+
+ASKED_TWICE = 8  # worlds for which a script must answer twice alike
 
 
 class UserScript:
     """Guards a script from outside this package: its states and memories are read-only, its results are checked.
 
-    Simulations share states and memories, so a script must not change either.
+    Simulations share states and memories, so a script must not change either. The first alert is shown twice, because
+    a script that then answers differently would give each agent other emergencies.
     """
 
     def __init__(self, script: Any) -> None:
         self.script, self.name = script, name_of(script)
         self.knows, self.needs_ahead = getattr(script, "knows", None), getattr(script, "needs_ahead", ())
+        self.is_asked_twice = False
 
     def begin(self, alert: State, body: int) -> Any:
+        memory = self._begin(alert, body)
+        if memory is not None and not self.is_asked_twice:
+            few = alert.take(slice(ASKED_TWICE))
+            first, second = (
+                [array.tobytes() for array in arrays_of(self._begin(few, body)) if not array.dtype.hasobject]
+                for _ in range(2)
+            )
+            if first != second:
+                raise AgentFailed(
+                    self.name,
+                    None,
+                    f"vehicle_{body}: begin answers differently for the same worlds; must draw random numbers from"
+                    " alert.generators(body), which are the same for every agent",
+                )
+            self.is_asked_twice = True
+        return memory
+
+    def _begin(self, alert: State, body: int) -> Any:
         return self._read_only(self.script.begin(alert.read_only(), body), alert.n, body)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Any, Any]:

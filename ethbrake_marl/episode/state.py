@@ -38,7 +38,8 @@ ENDED = 4  # 1 once the episode has ended
 NUMBER = 5  # number of the world in its list; -1: the caller has made it
 END = 6  # time at which the last step ends (s): the horizon, or earlier after `StepSettings.most_steps`
 FIRST_IN_LIST = -2  # NUMBER of world 0 of an evaluation list that a reset asked for; the next ones are -3, -4, ...
-CLOCK_COLUMNS = 7
+KEY = 7  # key of the world's random generators
+CLOCK_COLUMNS = 8
 
 
 class State(NamedTuple):
@@ -88,6 +89,15 @@ class State(NamedTuple):
         for view in (line, car, clock, know, wanted):
             view.setflags(write=False)
         return State(line, car, clock, know, wanted, self.memories)
+
+    def generators(self, body: int) -> list[np.random.Generator]:
+        """Random generator of each world for what happens to vehicle ``body``, such as its reaction time, [n].
+
+        It depends on seed and number of the world alone, so it is the same for every agent. Each call returns new
+        generators, at their first number.
+        """
+        keys = np.ascontiguousarray(self.clock[:, KEY]).view(np.uint64)
+        return [np.random.Generator(np.random.Philox(key=[key, body])) for key in keys.tolist()]
 
     @property
     def n(self) -> int:
@@ -272,6 +282,13 @@ def map_arrays(function: Callable[..., Any], memory: Any, *siblings: Any) -> Any
             for owner, part in memory.items()
         }
     return None if memory is None else function(memory, *siblings)
+
+
+def arrays_of(memory: Any) -> list[Any]:
+    """All arrays of a memory (``map_arrays``), in order."""
+    arrays: list[Any] = []
+    map_arrays(arrays.append, memory)
+    return arrays
 
 
 def take(memory: Any, rows: Any) -> Any:

@@ -84,7 +84,7 @@ class Wording:
         for key in path[:-1]:
             fields = [model.key_fields().get(str(key)) for model in models]
             inside = [field.annotation for field in fields if field is not None]
-            models = [nested_model for annotation in inside for nested_model in _models_in(annotation)] or models
+            models = [nested_model for annotation in inside for nested_model in models_in(annotation)] or models
         return list(dict.fromkeys(f.alias or name for model in models for name, f in model.key_fields().items()))
 
     def needed(self, path: YamlPath) -> str:
@@ -114,11 +114,11 @@ def explain(document: Document, error: ValidationError, wording: Wording) -> Inv
     return InvalidInput(f"{document.file if absent else document.where(path)}: {_describe(detail, path, wording)}")
 
 
-def _models_in(annotation: Any) -> Iterator[type[FileModel]]:
+def models_in(annotation: Any) -> Iterator[type[FileModel]]:
     if isinstance(annotation, type) and issubclass(annotation, FileModel):
         yield annotation
     for inner in get_args(annotation):
-        yield from _models_in(inner)
+        yield from models_in(inner)
 
 
 def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:

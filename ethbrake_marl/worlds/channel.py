@@ -7,9 +7,9 @@ A link leads from a sender j to a receiver i. The first message of j can be used
 with the message period T, the random wait ``U(0, T)`` for the next message, the number k of periods in which a burst of
 losses destroys every message, and the times for transmission L_radio, for processing t_proc, and until the brakes
 respond t_act. In each period a burst begins with probability p, and an ongoing burst ends with probability r; in the
-stationary state of this Gilbert-Elliott channel ``P(k >= m) = (p / (p + r)) (1 - r)^(m - 1)`` for m = 1, 2, ... With
-probability ``lost`` a link never delivers a message. A direct neighbour in sight is seen after a delay, the *hop*,
-drawn from ``sensing_s``.
+stationary state of this Gilbert-Elliott channel ``P(k >= m) = (p / (p + r)) (1 - r)^(m - 1)`` for m = 1, 2, ..., so a
+share p / (p + r) of all messages is lost; with r = 1 - p each on its own. With probability ``silent_links`` a link
+never delivers a message. A direct neighbour in sight is seen after a delay, the *hop*, drawn from ``sensing_s``.
 
 Vehicle i can react from ``latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))`` on: its own
 latency is over, and it has the message of Vehicle 1 or has seen the vehicle ahead brake. It reacts to vehicle j from
@@ -150,12 +150,18 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {"senses": "none"},
     "clear": {"loss_begins": 0.01, "loss_ends": 0.5},
     "nominal": {"loss_begins": 0.05, "loss_ends": 0.5},
-    "congested": {"loss_begins": 0.10, "loss_ends": 0.30, "lost": 0.05},
-    "blocked": {"loss_begins": 0.20, "loss_ends": 0.20, "lost": 0.20},
+    "congested": {"loss_begins": 0.10, "loss_ends": 0.30, "silent_links": 0.05},
+    "blocked": {"loss_begins": 0.20, "loss_ends": 0.20, "silent_links": 0.20},
     "sensors-only": {"hears": "none"},
 }  # the key `preset` of a preset of the user names the one of these on which it is based
 
+OLD_KEYS = {
+    "lost": "write silent_links for the share of links on which no message ever arrives; for 30 % of all"
+    " messages write loss_begins: 0.3, loss_ends: 0.7"
+}  # key of an earlier version -> what to write instead
+
 OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
+UNHEARD = ("link_latency_s", "silent_links", *OF_MESSAGES)  # without effect if no vehicle hears another
 
 
 class V2X(ScenarioPart):
@@ -176,7 +182,9 @@ class V2X(ScenarioPart):
     link_latency_s: Seconds | None = Field(
         default=None, description="fixed delay from every sender to every receiver, instead of a random one"
     )
-    lost: Share = Field(default=0.0, description="share of links (not of vehicles) on which no message arrives")
+    silent_links: Share = Field(
+        default=0.0, description="share of links (from one sender to one receiver) on which no message ever arrives"
+    )
     message_period_s: Annotated[Seconds, Field(ge=1e-3)] = Field(
         default=0.1, description="T, time between two messages of a sender"
     )
@@ -202,14 +210,14 @@ class V2X(ScenarioPart):
         if isinstance(value, V2X):
             return build(value)
         name = value.get("preset", "paper") if isinstance(value, dict) else value
-        right = f"must be a preset ({', '.join(PRESETS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
+        right = f"must be a preset ({', '.join(PRESETS)}), or a mapping such as {{preset: nominal, loss_begins: 0.1}}"
         place = ("preset",) if isinstance(value, dict) else ()
         require(isinstance(name, str) and name in PRESETS, place, name, right)
         written = value if isinstance(value, dict) else {"preset": value}
         known = (*cls.model_fields, *CHANNEL_KEYS)
         settings = dict(written)
         for key in written:
-            close = suggestion(str(key), known) or f"known: {', '.join(known)}"
+            close = OLD_KEYS.get(str(key)) or suggestion(str(key), known) or f"known: {', '.join(known)}"
             require(key in known, (key,), UNSHOWN, f"unknown key; {close}")
             if key in CHANNEL_KEYS:
                 part = CHANNEL_KEYS[key].keys.model_validate({key: written[key]})
@@ -240,22 +248,27 @@ class V2X(ScenarioPart):
         right = "belong to different channel keys, whose memories have the same name; leave one out"
         names = {channel_key.name for channel_key in extended}
         require(len(names) == len(extended), (), UNSHOWN, f"{' and '.join(extended.values())} {right}")
+        for key, why in self.without_effect().items():
+            require(key not in self._keys, (key,), getattr(self, key), f"has no effect, because {why}; leave it out")
+        silent = self.timing == "messages" or self.hears == "none" or self.silent_links > 0.0
+        blind = self.senses == "none" and silent and self.timing != "latency"
+        right = "a vehicle that may never get a message must see the vehicle ahead; use senses: both or front"
+        require(not blind, (), self, right)
+
+    def without_effect(self) -> dict[str, str]:
+        """Keys that change nothing in this channel, and why."""
         used_keys = [key for channel_key in self.channel_keys for key in channel_key.uses(self)]
         unused_keys = [key for key in OF_MESSAGES if key not in used_keys]
-        unheard = ("link_latency_s", "lost", *OF_MESSAGES)
+        reasons: dict[str, str] = {}
         for useless, keys, why in (
-            (self.senses == "none", ["sensing_s"], "senses: none means that no vehicle is in sight"),
-            (self.hears == "none", unheard, "hears: none means that no vehicle gets messages"),
+            (self.senses == "none", ("sensing_s",), "senses: none means that no vehicle is in sight"),
+            (self.hears == "none", UNHEARD, "hears: none means that no vehicle gets messages"),
             (self.timing == "latency", OF_MESSAGES, f"preset {self.preset} generates no messages"),
             (self.timing == "fixed", unused_keys, "link_latency_s fixes the delay of messages"),
         ):
             for key in keys if useless else ():
-                right = f"has no effect, because {why}; leave it out"
-                require(key not in self._keys, (key,), getattr(self, key), right)
-        silent = self.timing == "messages" or self.hears == "none" or self.lost > 0.0
-        blind = self.senses == "none" and silent and self.timing != "latency"
-        right = "a vehicle that may never get a message must see the vehicle ahead; use senses: both or front"
-        require(not blind, (), self, right)
+                reasons.setdefault(key, why)
+        return reasons
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -288,12 +301,12 @@ class V2X(ScenarioPart):
 
         In the paper's channel they do not: a vehicle knows everything as soon as its own latency is over.
         """
-        return self.timing != "latency" or (self.hears, self.senses, self.lost) != ("all", "none", 0.0)
+        return self.timing != "latency" or (self.hears, self.senses, self.silent_links) != ("all", "none", 0.0)
 
     @property
     def drawn(self) -> bool:
         """Whether random numbers decide what vehicles know of each other, or from when on."""
-        random_messages = self.hears != "none" and (self.timing == "messages" or 0.0 < self.lost < 1.0)
+        random_messages = self.hears != "none" and (self.timing == "messages" or 0.0 < self.silent_links < 1.0)
         random_sensing = self.senses != "none" and self.sensing_s[0] != self.sensing_s[1]
         random_keys = any(channel_key.is_random(self) for channel_key in self.channel_keys)
         return random_keys or (self.by_link and (random_messages or random_sensing))
@@ -308,7 +321,7 @@ class V2X(ScenarioPart):
             periods = burst_periods(u[..., 1], self.loss_begins, self.loss_ends)
             on_the_way = self.radio_s + self.processing_s + self.actuation_s
             delay = (u[..., 0] + periods) * self.message_period_s + on_the_way
-        delay[u[..., 2] < self.lost] = np.inf
+        delay[u[..., 2] < self.silent_links] = np.inf
         return delay
 
     def heard_and_seen(self, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
@@ -351,8 +364,8 @@ class V2X(ScenarioPart):
 def register_preset(name: str, settings: Mapping[str, Any]) -> None:
     """Register a V2X channel as the preset ``name``, for ``v2x: name`` in scenarios.
 
-    ``settings``: content of the key ``v2x``, such as ``{"preset": "nominal", "lost": 0.1}``. Raises ``AlreadyExists``
-    if another channel has the name, ``InvalidInput`` for a bad name or bad settings.
+    ``settings``: content of the key ``v2x``, such as ``{"preset": "nominal", "loss_begins": 0.1}``. Raises
+    ``AlreadyExists`` if another channel has the name, ``InvalidInput`` for a bad name or bad settings.
     """
     if not isinstance(name, str) or re.fullmatch(NAME_PATTERN, name) is None:
         raise InvalidInput(
@@ -360,7 +373,7 @@ def register_preset(name: str, settings: Mapping[str, Any]) -> None:
             " digit"
         )
     document = Document(f"preset {name!r}", settings, {})
-    v2x = read_model(document, V2X, Wording(V2X), "such as {'lost': 0.1}")
+    v2x = read_model(document, V2X, Wording(V2X), "such as {'loss_begins': 0.1}")
     written = {key: getattr(v2x, key) for key in v2x._keys if key != "preset"}
     preset = {"preset": v2x.preset, **PRESETS[v2x.preset], **written}
     if PRESETS.setdefault(name, preset) != preset:

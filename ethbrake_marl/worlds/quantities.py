@@ -27,6 +27,7 @@ TYPES = (3,)  # types and loads of the vehicles
 MIXTURE = (4,)  # scenario of a mixture
 SURROUNDINGS = (6,)  # friction, row of the table, time before the alert
 BRAKES = (7,)  # brake rates, release rates, weights of harm
+GENERATORS = (8,)  # key of the random generators of scripts
 
 NUMBERS_PER_VEHICLE = 8  # numbers of one vehicle in the streams MAIN and BRAKES
 PER_TYPE = 4  # numbers of one vehicle in TYPES: type, load, two unused

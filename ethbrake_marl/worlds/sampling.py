@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.state import State, mark
+from ethbrake_marl.episode.state import KEY, State, mark
 from ethbrake_marl.episode.step import StepSettings, at_alert, first_decision
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.motion import layout
@@ -21,6 +21,7 @@ from ethbrake_marl.worlds.mixture import require_one_line
 from ethbrake_marl.worlds.physics import departures_by
 from ethbrake_marl.worlds.quantities import (
     CAR_QUANTITIES,
+    GENERATORS,
     MIXTURE,
     NEWS,
     OF_WORLD,
@@ -193,7 +194,9 @@ def state_of(scenario: Scenario, quantities: QuantityValues, numbers: Numbers, u
     for i, name in enumerate(scenario.vehicle_names):
         wanted[:, i + 1] = first_command(scenario.roles[name], quantities["braking_capacity_mps2"][:, i])
     memories = {key.name: key.at_alert(scenario, numbers, unheard, n) for key in scenario.v2x.channel_keys}
-    return mark(at_alert(line, car, know, wanted, index)._replace(memories=memories), departures_by(scenario.physics))
+    alert = at_alert(line, car, know, wanted, index)._replace(memories=memories)
+    alert.clock[:, KEY] = numbers(OF_WORLD, GENERATORS)[:, 0]
+    return mark(alert, departures_by(scenario.physics))
 
 
 def _draw_accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> DrawnWorlds:

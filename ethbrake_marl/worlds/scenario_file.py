@@ -13,6 +13,8 @@ from ethbrake_marl.files.model import NAME_PATTERN
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import YAML_SIZE_LIMIT, flow_text, parse_yaml
 from ethbrake_marl.worlds.catalogue import load_scenario, scenario_path
+from ethbrake_marl.worlds.channel import V2X
+from ethbrake_marl.worlds.channel_table import key_table, values_of
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
 from ethbrake_marl.worlds.quantities import ALTERNATIVES, QUANTITIES
 from ethbrake_marl.worlds.scenario import Scenario
@@ -77,12 +79,26 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path
 
 
 def whole_text(scenario: str | Path) -> str:
-    """Text of a scenario's file. If the scenario is based on another one: a text with all values of the scenario."""
+    """Text of a scenario's file. If the scenario is based on another one: a text with all values of the scenario.
+
+    Comments at the end show all keys of ``v2x``, if the scenario has it.
+    """
     path, loaded = scenario_path(scenario), load_scenario(scenario)
     text = read_plain(path, YAML_SIZE_LIMIT).decode("utf-8")
-    if "based_on" not in parse_yaml(text).content:
-        return text
-    return "".join(f"{key}: {flow_text(value)}\n" for key, value in loaded.declared().items())
+    declared, has_channel = loaded.declared(), "v2x" in loaded.model_fields_set and not loaded.members
+    if "based_on" in parse_yaml(text).content:
+        if has_channel:
+            declared["v2x"] = values_of(loaded.v2x)
+        text = "".join(f"{key}: {flow_text(value)}\n" for key, value in declared.items())
+    return text + (_channel_comment(loaded.v2x) if has_channel else "")
+
+
+def _channel_comment(v2x: V2X) -> str:
+    rows = key_table(v2x)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    head = "All keys of v2x: the value here, and the value of each preset (–: none, or without effect)"
+    return "".join(f"# {line}\n" for line in [head, *lines])
 
 
 def scenario_json_schema() -> dict[str, Any]:

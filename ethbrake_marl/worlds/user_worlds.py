@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import KEY, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import suggestion
 from ethbrake_marl.motion.layout import Floats
@@ -199,7 +199,9 @@ def _worlds(
     def no_chance(width: int, stream: tuple[int, ...]) -> Floats:
         return np.zeros((n, width))
 
-    return state_of(scenario, values, no_chance, scenario.unheard(), np.full(n, -1))
+    worlds = state_of(scenario, values, no_chance, scenario.unheard(), np.full(n, -1))
+    worlds.clock[:, KEY] = np.arange(n)
+    return worlds
 
 
 def _short_text(value: Any) -> str:

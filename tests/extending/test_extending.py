@@ -18,7 +18,7 @@ from tests.training.tiny import TINY
 
 near = pytest.approx
 PAPER = eb.load_scenario("paper-random")
-RURAL = {"preset": "nominal", "lost": 0.3, "link_latency_s": 0.2}
+RURAL = {"preset": "nominal", "silent_links": 0.3, "link_latency_s": 0.2}
 LISTED = ["own", "front_1", "rear_1.known", "urgency", "rear_1.load"]
 MINE = f'''
 import numpy as np
@@ -166,8 +166,8 @@ def test_preset__is_drawn_like_the_mapping_that_it_stands_for(tmp_path: Path) ->
     assert drawn[0].know.tobytes() == drawn[1].know.tobytes() != PAPER.sample(20, 3).know.tobytes()
     (tmp_path / "rural.yaml").write_text(yaml.safe_dump({**rural.declared(), "name": "rural"}))
     assert eb.load_scenario(tmp_path / "rural.yaml").v2x == rural.v2x
-    clear = rural.replace(v2x={"preset": "rural", "lost": 0.0})
-    assert (clear.v2x.lost, clear.v2x.link_latency_s) == (0.0, rural.v2x.link_latency_s)
+    clear = rural.replace(v2x={"preset": "rural", "silent_links": 0.0})
+    assert (clear.v2x.silent_links, clear.v2x.link_latency_s) == (0.0, rural.v2x.link_latency_s)
 
 
 @pytest.mark.usefixtures("mine")

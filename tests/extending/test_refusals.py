@@ -164,7 +164,7 @@ def test_objective__arguments_are_texts_or_numbers() -> None:
 def test_v2x_key__has_a_name_and_keys() -> None:
     class Keys(ScenarioPart):
         gap_noise_m: float = 0.0
-        lost: float = 0.0
+        silent_links: float = 0.0
 
     class GapNoise(ChannelKey):
         name, keys = "gap_noise", Keys
@@ -173,4 +173,4 @@ def test_v2x_key__has_a_name_and_keys() -> None:
         with pytest.raises(InvalidInput, match=f"key '{key}' of v2x: .* must be a ChannelKey with a name"):
             register_v2x_key(key, wrong)  # type: ignore[arg-type]
     with pytest.raises(AlreadyExists, match="already in use"):
-        register_v2x_key("lost", GapNoise())
+        register_v2x_key("silent_links", GapNoise())

@@ -69,14 +69,14 @@ def test_latest_reaction__bounds_all_that_is_drawn(preset: str) -> None:
 
 def test_presets_of_ones_own() -> None:
     for _ in range(2):
-        register_preset("test-lossy", {"preset": "nominal", "lost": 0.5})
+        register_preset("test-lossy", {"preset": "nominal", "silent_links": 0.5})
         register_preset("test-mute", {"hears": "front"})
     lossy, mute = V2X.model_validate({"preset": "test-lossy", "loss_ends": 1.0}), V2X.model_validate("test-mute")
-    assert (lossy.timing, lossy.loss_begins, lossy.loss_ends, lossy.lost) == ("messages", 0.05, 1.0, 0.5)
+    assert (lossy.timing, lossy.loss_begins, lossy.loss_ends, lossy.silent_links) == ("messages", 0.05, 1.0, 0.5)
     assert (mute.timing, mute.hears, mute.by_link) == ("latency", "front", True)
     with refused("preset 'test-lossy': another channel is already registered under this name", AlreadyExists):
         register_preset("test-lossy", {"preset": "nominal"})
     with refused("preset 'Lossy': the name must be 1 to 64 characters"):
         register_preset("Lossy", {})
-    with refused("preset 'y': must be a mapping such as {'lost': 0.1}"):
+    with refused("preset 'y': must be a mapping such as {'loss_begins': 0.1}"):
         register_preset("y", 3)  # type: ignore[arg-type]

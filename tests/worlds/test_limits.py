@@ -109,7 +109,7 @@ OTHERS: dict[str, tuple[list[Any], list[Any]]] = {  # key -> accepted, refused
     "name": (["a", "a" * 64, "0-_"], ["", "a" * 65, "-a", "A"]),
 }
 CHANNEL: dict[str, tuple[list[Any], list[Any]]] = {
-    "lost": ([0.0, 1.0], [-LEAST, math.nextafter(1.0, 2.0)]),
+    "silent_links": ([0.0, 1.0], [-LEAST, math.nextafter(1.0, 2.0)]),
     "loss_ends": ([0.01, 1.0], [math.nextafter(0.01, 0.0), math.nextafter(1.0, 2.0)]),
     "message_period_s": ([1e-3, 60.0], [math.nextafter(1e-3, 0.0), math.nextafter(60.0, 61.0)]),
     "link_latency_s": ([0.0, 60.0], [-LEAST, math.nextafter(60.0, 61.0)]),

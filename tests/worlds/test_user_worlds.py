@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.state import NUMBER
+from ethbrake_marl.episode.state import KEY, NUMBER
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.describe import quantities_of
 from ethbrake_marl.worlds.user_worlds import read_worlds, world_columns, worlds_from_state, worlds_from_table
@@ -44,7 +44,7 @@ def test_table_of_what_was_drawn__is_the_same_worlds(name: str) -> None:
     for part in ("line", "car", "know", "wanted"):
         assert getattr(given, part).tobytes() == getattr(drawn.worlds, part).tobytes(), part
     clock = drawn.worlds.clock.copy()
-    clock[:, NUMBER] = -1.0  # they are of no list
+    clock[:, NUMBER], clock[:, KEY] = -1.0, np.arange(50)  # they are of no list
     assert given.clock.tobytes() == clock.tobytes() and given.memories == drawn.worlds.memories == {}
 
 

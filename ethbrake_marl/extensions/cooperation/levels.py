@@ -37,7 +37,7 @@ WORD = re.compile(r"\s*([A-Za-z][\w-]*:)?", re.ASCII)
 class Swept(NamedTuple):
     """The key of a scenario that a sweep varies, with one of its values."""
 
-    key: str  # such as v2x.lost
+    key: str  # such as v2x.silent_links
     word: str  # text before the number in the value, such as ``social:``; usually empty
     text: str  # the number
 
@@ -55,7 +55,7 @@ class Swept(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Suffix of the level's name, such as ``social-15`` or ``v2x.lost-0.1``."""
+        """Suffix of the level's name, such as ``social-15`` or ``v2x.silent_links-0.1``."""
         return f"{self.word.rstrip(':') or self.key}-{self.text}"
 
 
@@ -134,7 +134,8 @@ def parse_sweep(text: str) -> list[Swept]:
         if not (key and equals and parsed):
             raise InvalidInput(
                 f"--sweep {text!r:.200}: must be KEY=LOW..HIGH:STEP or KEY=A,B,... with numbers, for instance"
-                " objective=social:0..90:15 or v2x.lost=0,0.1,0.3; for other values, give scenarios with --levels"
+                " objective=social:0..90:15 or v2x.silent_links=0,0.1,0.3; for other values, give scenarios with"
+                " --levels"
             )
         low, high, step = (Decimal(part or 0) for part in parsed.group("low", "high", "step"))
         steps = (high - low) / step if step > 0 else Decimal(0)

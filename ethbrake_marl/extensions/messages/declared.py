@@ -50,7 +50,7 @@ class MessageKeys(ScenarioPart):
     persistence: Literal["first", "periodic"] | None = Field(
         default=None,
         description="what a receiver knows after the first message: first: always the present state of the sender;"
-        " periodic: the state in the newest message that arrived",
+        " periodic: the state in the newest message that arrived; by default first",
     )
     tells: (
         Annotated[

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,13 +12,18 @@ import numpy as np
 from ethbrake_marl.agent_names import AgentSettings, make_agent
 from ethbrake_marl.agents.e_v2x_bm import Predicting
 from ethbrake_marl.agents.team import Agent, Team
-from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput, Unfamiliar, check_whole_number
-from ethbrake_marl.extensions.search.best_harm import SEARCH_BUDGET, agent_commands, e_v2x_bm_profiles
-from ethbrake_marl.extensions.search.pricing import Problem, problem_of, with_braking
+from ethbrake_marl.extensions.search.best_harm import (
+    SEARCH_BUDGET,
+    agent_commands,
+    best_harm as search_best_harm,
+    e_v2x_bm_profiles,
+)
+from ethbrake_marl.extensions.search.pricing import Problem, Profiles, have_one_objective, problem_of, with_braking
 from ethbrake_marl.extensions.search.search import refine, search_profiles
 from ethbrake_marl.extensions.search.tables import best_stored, outdated_tables
 from ethbrake_marl.motion.layout import Floats
@@ -73,7 +79,8 @@ class BestHarm(Planner):
     """Agent that drives the best known commands: from a shipped table, or from a search.
 
     If it is the only learner, it never does more harm than E-V2X-BM and a shipped policy, whose commands are improved
-    once more.
+    once more. Several learners with one objective follow the joint optimum of an ablation: the best known commands of
+    all of them together.
     """
 
     def __init__(
@@ -81,6 +88,35 @@ class BestHarm(Planner):
     ) -> None:
         super().__init__(name, scenario, harm_count)
         self.budget = budget
+        self.last_plan: tuple[bytes, SearchMemory] | None = None  # worlds, and plan of all learners, who ask in turn
+
+    def begin(self, alert: State, body: int) -> SearchMemory:
+        learners = self.scenario.learners
+        is_joint = len(learners) > 1 and body in learners
+        if not is_joint or not have_one_objective(alert, self.scenario.objective, learners):
+            return super().begin(alert, body)
+        plan = self.joint_plan(alert)
+        return plan._replace(commands_mps2=plan.commands_mps2[:, :, learners.index(body)])
+
+    def joint_plan(self, alert: State) -> SearchMemory:
+        """Commands of all L learners, [n, T, L] m/s2."""
+        check_known_commands(self.scenario, self.scenario.learners)
+        game, objective = game_of(self.scenario, {})[1], self.scenario.objective
+        problem = problem_of(game, alert, harm_count=self.harm_count, objective=objective)
+        worlds = problem.identity.tobytes()
+        if self.last_plan is None or self.last_plan[0] != worlds:
+            known_harm, profiles = best_stored(problem, self.harm_count)
+            commands = profiles.stepwise(int(problem.last_step.max()))
+            some = (np.isinf(known_harm) | (objective != "total")).nonzero()[0]
+            if len(some):
+                counts = BUILT_IN_COUNTS if self.harm_count in BUILT_IN_COUNTS else (self.harm_count,)
+                table = search_best_harm(
+                    game, alert.take(some), harm_counts=counts, budget=self.budget, objective=objective
+                )
+                commands[some] = table.profiles[self.harm_count.name].stepwise(commands.shape[1])
+            harm = problem.value(problem.follow(Profiles.of_steps(commands, problem.last_step)))
+            self.last_plan = worlds, SearchMemory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
+        return self.last_plan[1]
 
     def check(self, game: Game, body: int) -> None:
         """Warn (``Unfamiliar``) if the scenario's table was made for other physics and is not used."""
@@ -139,15 +175,20 @@ def single_learner_game(scenario: Scenario, alert: State, body: int) -> tuple[Ga
 
     Raises ``InvalidInput`` if another vehicle's commands are not known at the alert.
     """
+    check_known_commands(scenario, [body])
+    braking_learners = [learner for learner in scenario.learners if learner != body]
+    _, game = game_of(scenario.with_learners([scenario.vehicle_names[body - 1]]), {})
+    return game, with_braking(alert, braking_learners)
+
+
+def check_known_commands(scenario: Scenario, bodies: Sequence[int]) -> None:
+    """Raise ``InvalidInput`` if the commands of a vehicle that is not among ``bodies`` are not known at the alert."""
     for vehicle, role in enumerate(scenario.roles.values(), 1):
-        if vehicle != body and role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):
+        if vehicle not in bodies and role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):
             raise InvalidInput(
                 f"scenario {scenario.name!r}: vehicle_{vehicle} is driven by {role!r}, whose commands are not known at"
                 " the alert; a search needs scripts that hold one command"
             )
-    braking_learners = [learner for learner in scenario.learners if learner != body]
-    _, game = game_of(scenario.with_learners([scenario.vehicle_names[body - 1]]), {}, "harm")  # the reward is not used
-    return game, with_braking(alert, braking_learners)
 
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> BestHarm:

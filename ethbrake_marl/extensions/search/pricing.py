@@ -349,13 +349,22 @@ def with_objective(problem: Problem, objective: Declared) -> Problem:
         return problem
     if set(forms) == {"maximin"}:
         return problem.with_weights(np.ones(problem.state.vehicles), largest=True)
-    weights = [] if "maximin" in forms else [objectives[i].weights(car, i) for i in chosen]
-    if not weights or any(not np.array_equal(weights[0], vector) for vector in weights[1:]):
+    if not have_one_objective(problem.state, objective, problem.bodies.tolist()):
         raise InvalidInput(
             f"objective {objective!r}: the {len(chosen)} controlled vehicles have different objectives, but a search"
             " minimises one; give all of them the same, for instance weighted:1,4,1"
         )
-    return problem.with_weights(weights[0])
+    return problem.with_weights(objectives[chosen[0]].weights(car, chosen[0]))
+
+
+def have_one_objective(state: State, objective: Declared, bodies: Sequence[int]) -> bool:
+    """Whether several vehicles minimise the same: all the harm of the line, ``maximin``, or one weighted sum."""
+    objectives = objectives_of(objective, state.vehicles)
+    forms = {objectives[body - 1].kind.form for body in bodies}
+    if len(forms) == 1 and forms <= {"total", "maximin"}:
+        return True
+    weights = [] if "maximin" in forms else [objectives[body - 1].weights(state.car, body - 1) for body in bodies]
+    return len(weights) > 0 and all(np.array_equal(weights[0], vector) for vector in weights[1:])
 
 
 @kernel

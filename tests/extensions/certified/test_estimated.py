@@ -16,7 +16,7 @@ from tests.extensions.certified.attack import attacked
 from tests.refused import refused
 
 BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
-CHANCE = {"preset": "congested", "lost": 0.0}  # vehicle_3 reacts after the latest message
+CHANCE = {"preset": "congested", "silent_links": 0.0}  # vehicle_3 reacts after the latest message
 LATER = BASE.replace(
     gaps_m=[{"uniform": [5, 10]}, {"uniform": [5, 10]}], speeds_mps={"uniform": [18, 22]}, v2x=CHANCE,
     latency_s=[0.0, 0.2, 6.0], mass_t=[4.5, 5.5, {"uniform": [3.0, 9.0]}],

@@ -9,6 +9,9 @@ import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import IMPACT_COUNTS, HarmCount
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.extensions.search.agents import SearchAround
+from ethbrake_marl.extensions.search.best_harm import search_list
+from ethbrake_marl.extensions.search.pricing import problem_of
+from ethbrake_marl.extensions.search.tables import best_stored
 from ethbrake_marl.training.experiment import usable
 from tests.refused import refused
 
@@ -109,6 +112,31 @@ def test_planners__in_a_role_in_a_team_and_inside_a_shield() -> None:
     pair = eb.evaluate("cooperation-3-pair", "best_harm:50,full_brake", episodes=6, seed=4)
     assert pair["best_harm:50"]["honest_cost"].sum() < pair["full_brake"]["honest_cost"].sum()
     assert alone["full_brake+search+step"]["replaced_actions"].shape == (6,)
+
+
+@pytest.mark.parametrize(
+    ("name", "budget", "episodes"),
+    [("cooperation-4-all", 600, 2), ("cooperation-3-pair", 300, 3), ("benchmark-all", 1, 4)],
+)
+def test_best_harm__of_several_learners_is_the_joint_search(name: str, budget: int, episodes: int) -> None:
+    scenario, game = eb.open_game(name)
+    worlds = scenario.sample(episodes, seed=7)
+    spec = f"best_harm:{budget}"
+    result = eb.evaluate(name, [spec, "full_brake+search"], episodes=episodes)
+    together, alone = (result[agent]["honest_cost"] for agent in result)
+    problem = problem_of(game, worlds)
+    stored = best_stored(problem, HarmCount.of("honest"))[0]
+    searched = search_list(game, worlds, harm_counts=BUILT_IN_COUNTS, budget=budget).harm["honest"]
+    expected = np.where(np.isfinite(stored), stored, searched)  # the value of every table
+    assert together.tolist() == expected.tolist()
+    assert together.mean() < alone.mean()
+
+
+def test_best_harm__of_learners_with_different_objectives_searches_for_each_alone() -> None:
+    pair = eb.load_scenario("cooperation-3-pair")
+    (both,) = eb.evaluate(pair.replace(objective="own"), "best_harm:60", episodes=3).columns.values()
+    (same,) = eb.evaluate(pair.replace(objective="maximin"), "best_harm:60", episodes=3).columns.values()
+    assert both["honest_cost"].tolist() != same["honest_cost"].tolist()
 
 
 def test_limits__are_regret_and_share_of_the_possible_reduction() -> None:
