@@ -37,8 +37,9 @@ LAST = 3  # number of the last step, unless all vehicles come to rest before
 ENDED = 4  # 1 once the episode has ended
 NUMBER = 5  # number of the world in its list; -1: the caller has made it
 END = 6  # time at which the last step ends (s): the horizon, or earlier after `StepSettings.most_steps`
+HORIZON = 7  # the game's horizon (s), at which motion has a price
 FIRST_IN_LIST = -2  # NUMBER of world 0 of an evaluation list that a reset asked for; the next ones are -3, -4, ...
-CLOCK_COLUMNS = 7
+CLOCK_COLUMNS = 8
 
 
 class State(NamedTuple):

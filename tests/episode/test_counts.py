@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agent_names import make_agent, open_game
 from ethbrake_marl.episode.counts import COUNTED_ROWS, COUNTS, EXACT_IMPACTS, HONEST, HarmCount, pair_amounts
 from ethbrake_marl.episode.game import Game
@@ -33,11 +34,12 @@ def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_h
     # Coasting, Vehicle 2 hits with 6 m/s at 1 s: 18.5 m/s in common. Vehicle 1 of 1 t brakes with 6 m/s2 against the
     # 3 t behind it for 0.3 s: a push of 1.8 m/s, and 18.5 - 0.3 x 1.5 = 18.05 m/s of both at the horizon.
     # Of the impact Vehicle 1 bears 3/4; Vehicle 2 bears the price of its push, each that of its own motion.
-    _, game = open_game(CRASH, reward="honest", reward_vector="vehicles")
+    scenario = CRASH.replace(obstacle_gap_m=1000)
+    _, game = open_game(scenario, learners=["vehicle_1", "vehicle_2"], reward="honest", reward_vector="vehicles")
     state, counted, borne = game.reset(game.draw(1, 0, 0)), 0.0, np.zeros(2)
     while not state.ended[0]:
         assert not state.line[:, MOVING].any()
-        state, step = game.step(state, np.zeros((1, 1)))
+        state, step = game.step(state, np.array([[-1.0, 0.0]]))
         counted += step.cost[0]
         assert step.vector is not None
         borne -= step.vector[0, 0]
@@ -50,6 +52,28 @@ def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_h
     expected = [0.75 * 36.0 + 18.05**2, 0.25 * 36.0 + 10 * 1.8 + 18.05**2]
     assert state.borne_harm("honest")[0].tolist() == near(expected) and borne.tolist() == near(expected)
     assert amounts(objectives_of("own", 2), None, state, HONEST)[0].tolist() == near(expected)
+
+
+@pytest.mark.parametrize(("scripts", "moving"), [
+    ({1: "coast"}, [0.0, 12.0**2 - 10.0**2, 0.0]),  # Vehicle 3 is slower than the script ahead
+    ({}, [10.0**2, 12.0**2, 9.0**2]),
+    ({2: "coast"}, [10.0**2, 0.0, 0.0]),
+    ({1: "full_brake"}, [0.0, 12.0**2 - 2.2**2, 9.0**2 - 2.2**2]),  # with 6 m/s2 for 1.3 s
+    ({1: "coast", 2: "coast", 3: "coast"}, [0.0] * 3),
+    ({3: "coast"}, [10.0**2, 12.0**2, 0.0]),
+])  # fmt: skip
+def test_motion_at_the_horizon__costs_what_no_script_prescribes(scripts: dict[int, str], moving: list[float]) -> None:
+    roles = {f"vehicle_{i}": scripts.get(i, "learner") for i in (1, 2, 3)}
+    scenario = eb.Scenario(
+        name="apart", vehicles=3, gaps_m=50, speeds_mps=[10, 12, 9], braking_capacity_mps2=6, driving_capacity_mps2=6,
+        mass_t=1, latency_s=0, horizon_s=1.3, roles=roles, obstacle_gap_m=1000,
+    )  # fmt: skip
+    _, game = open_game(scenario)
+    state = game.reset(scenario.sample(1, seed=7))
+    coasting = np.zeros((1, 1, 3 - len(scripts)))
+    last, cost = follow_plans(game, state, coasting, HONEST)
+    assert last.line[0, MOVING].tolist() == near([*moving, 0.0]) and cost.tolist() == near([sum(moving)])
+    assert last.departures == {"obstacle"}
 
 
 def test_honest__adds_nothing_to_a_line_that_brakes_to_rest_and_prices_driving_there() -> None:
