@@ -201,10 +201,11 @@ class State(NamedTuple):
         return pair_amounts(self.line, self._defined(harm_count))[0, :, 1:-1]
 
     def borne_harm(self, harm_count: AnyCount = HONEST) -> Floats:
-        """Harm that each vehicle has borne so far, [n, N] m2/s2. The two shares of a pair sum to the pair's harm."""
-        (pairs, unshared), out = pair_amounts(self.line, self._defined(harm_count)), np.empty((self.n, self.vehicles))
+        """Harm that each vehicle has borne so far, [n, N] m2/s2. It sums to the harm of the line."""
+        pairs, unshared, conduct = pair_amounts(self.line, self._defined(harm_count))
+        out = np.empty((self.n, self.vehicles))
         split_harm(pairs - unshared, self.car[:, MASS], out)
-        return out + unshared[:, :-1]
+        return out + conduct[:, :-1]
 
     @property
     def departures(self) -> frozenset[str]:

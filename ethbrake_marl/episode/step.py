@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.commands import LARGEST_ACTION, action_array, check_actions, write_commands
-from ethbrake_marl.episode.counts import HONEST, OF_FIRST, OF_TOTAL, HarmCount, beside_harm
+from ethbrake_marl.episode.counts import HONEST, OF_FIRST, OF_TOTAL, HarmCount, amount_so_far, cost_of_step
 from ethbrake_marl.episode.script_calls import ask_scripts
 from ethbrake_marl.episode.state import (
     CLOCK_COLUMNS,
@@ -196,7 +196,7 @@ def step_rows(
         if clock[k, ENDED] == 1.0:
             continue
         write_commands(car[k], wanted[k], learners, actions[k])
-        before = beside_harm(line[k], weights)
+        before = amount_so_far(line[k], weights)
         outcome, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
         if outcome == FAILED:
             failed = k
@@ -211,7 +211,7 @@ def step_rows(
         out[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
         out[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
         impact_harm = weights[OF_FIRST] * out[FIRST_HARM, k] + weights[OF_TOTAL] * out[TOTAL_HARM, k]
-        cost = impact_harm + (beside_harm(line[k], weights) - before)
+        cost = cost_of_step(before, line[k], impact_harm, weights)
         shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * cost
         out[COST, k] = cost
         for i in range(bodies - 1):

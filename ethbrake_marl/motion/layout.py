@@ -4,8 +4,8 @@ Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, f
 In a row of pairs, column p is the pair (body p, body p + 1). Column 0 exists in every world: without an obstacle its
 gap is ``FAR_M``, and the physics leaves it out.
 
-Arrays that most functions share: ``line`` [12, N + 1] changes, ``car`` [11, N + 1] stays the same, ``scratch`` [38, N +
-1] is the working memory of one call. A batch of n worlds has one more axis in front: ``line`` [n, 12, N + 1], ``car``
+Arrays that most functions share: ``line`` [13, N + 1] changes, ``car`` [11, N + 1] stays the same, ``scratch`` [38, N +
+1] is the working memory of one call. A batch of n worlds has one more axis in front: ``line`` [n, 13, N + 1], ``car``
 [n, 11, N + 1].
 """
 
@@ -31,7 +31,8 @@ DROVE = 8  # of the pair's rear vehicle: speed that its engine alone would have 
 MOVING = 9  # of the pair's rear vehicle: square of its speed at the horizon (m2/s2)
 THROWN = 10  # change of the closing speed by impacts since the pair last touched (m/s)
 PASSED = 11  # harm that the contact passes on in impacts, beyond the harm of its own closing speed (m2/s2)
-LINE_ROWS = 12
+ANSWERED = 12  # of the pair's rear vehicle: part of all pushes for which this vehicle answers (m/s)
+LINE_ROWS = 13
 
 # rows of `car`
 MASS = 0  # t; infinite: the obstacle

@@ -17,7 +17,7 @@ from ethbrake_marl.episode.play import follow_plans, price
 from ethbrake_marl.episode.reward import RewardParams, reward_params
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.evaluate import evaluate
-from ethbrake_marl.motion.layout import BRAKING, DRIVING, DROVE, MOVING, PUSHED
+from ethbrake_marl.motion.layout import ANSWERED, BRAKING, DRIVING, DROVE, MOVING, PUSHED
 from ethbrake_marl.shields.step import StepShield
 from tests.contract.interfaces import CRASH, REST
 from tests.episode.lines import later, state_of
@@ -107,8 +107,9 @@ def test_amounts__of_pairs_and_worlds_have_the_weights_of_the_count() -> None:
 # ---------------------------------------------------------------- in random worlds
 
 
-def opened(name: str, count: str) -> tuple[Game, State]:
-    _, game = open_game(name, reward={"harm": 1.0, "harm_count": count})
+def opened(name: str, count: str, horizon_s: float = 8.0) -> tuple[Game, State]:
+    scenario = eb.load_scenario(name).replace(horizon_s=horizon_s)
+    _, game = open_game(scenario, reward={"harm": 1.0, "harm_count": count})
     return game, game.reset(game.draw(N, 5, 0))
 
 
@@ -123,8 +124,9 @@ def random_plans(game: Game, state: State, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_counts__are_ordered_never_fall_and_are_the_sum_of_what_steps_count(name: str) -> None:
+    stops = name in ("paper-random-obstacle", "cooperation-4-all")
     for count in COUNTS:
-        game, state = opened(name, count)
+        game, state = opened(name, count, 8.0 if stops else 2.0)
         plans, counted = random_plans(game, state, 1), state.harm(count)
         while not state.ended.all():
             before = {each: state.harm(each) for each in COUNTS}
@@ -137,7 +139,30 @@ def test_counts__are_ordered_never_fall_and_are_the_sum_of_what_steps_count(name
             assert (state.harm("total") >= state.harm("first")).all()
         assert counted == near(state.harm(count), rel=1e-12, abs=1e-9)
         met = (state.line[:, [PUSHED, DROVE, MOVING]] > 0.0).any(axis=(0, 2)).tolist()
-        assert met == [True, True, name not in ("paper-random-obstacle", "cooperation-4-all")]
+        assert met == [True, True, not stops]
+
+
+@pytest.mark.parametrize("name", [*SCENARIOS, "benchmark-truck", "benchmark-all", "realistic-truck-buildup"])
+def test_borne_harm__sums_to_that_of_the_line(name: str) -> None:
+    game, state = opened(name, "honest")
+    for plans in (random_plans(game, state, 1), np.full((N, 1, len(game.settings.learners)), -1.0)):
+        last, cost = follow_plans(game, state, plans, HONEST)
+        assert last.borne_harm().sum(axis=1) == near(cost, rel=1e-12)
+        own = amounts(objectives_of("own", last.vehicles), None, last, HONEST)
+        assert own.sum(axis=1) == near(cost, rel=1e-12) and (own >= 0.0).all()
+    common = last.line[:, PUSHED].sum(axis=1) / last.vehicles  # all brake with all they have
+    assert not last.line[:, ANSWERED].any()
+    impacts = last.borne_harm(eb.HarmCount("impacts", [0, 1, 1, 0, 0, 0], "impacts", "impacts", (EXACT_IMPACTS,)))
+    moving = np.where(last.moving[:, np.newaxis], np.nan, 0.0)
+    assert np.nan_to_num(last.borne_harm() - impacts + moving - 10.0 * common[:, np.newaxis]) == near(0.0, abs=1e-9)
+
+
+def test_own__gains_nothing_by_leaning_back_on_brakes_that_are_weaker() -> None:
+    _, game = open_game("cooperation-3-pair")
+    state = game.reset(eb.load_scenario("cooperation-3-pair").sample(2, seed=7)).take([1])
+    ends = [follow_plans(game, state, np.array([[[-1.0, action]]]), HONEST) for action in np.linspace(-1.0, -0.5, 6)]
+    own = np.array([last.borne_harm()[0, 2] for last, _ in ends])
+    assert (own[1:] >= own[0] - 1e-9).all()
 
 
 @pytest.mark.parametrize("count", COUNTS)

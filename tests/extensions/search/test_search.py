@@ -22,11 +22,12 @@ from ethbrake_marl.extensions.search.search import (
     search_profiles,
 )
 from ethbrake_marl.extensions.search.tables import BestHarmTable
-from ethbrake_marl.motion.layout import DROVE, MOVING, Floats
+from ethbrake_marl.motion.layout import DROVE, MOVING, PUSHED, Floats
 from tests.extensions.proofs.worlds import worlds
 from tests.refused import refused
 
 SCENARIO, GAME = eb.open_game("paper-random")
+SHORT = eb.open_game(SCENARIO.replace(horizon_s=1.0))[1]  # Vehicle 2 has not yet reached Vehicle 1
 
 # harms in m2/s2, to the last bit: scenario, objective, count, the first six worlds of seed 7
 GOLDEN = [
@@ -162,7 +163,7 @@ def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_
 
 @pytest.mark.parametrize("stepwise", [False, True])
 def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool) -> None:
-    problem, values = paper().with_count("honest"), np.empty(1)
+    problem, values = problem_of(SHORT, sampled(), harm_count="honest"), np.empty(1)
     driving, random = problem.constant(problem.bounds[:, np.newaxis, :, 1]), random_states(problem.identity, 0)
     last = problem.follow(driving)
     assert last.line[:, MOVING].any(axis=1).all()
@@ -174,10 +175,11 @@ def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool
 
 @pytest.mark.parametrize("objective", ["own", "weighted:1,4,2", "maximin"])
 def test_value__of_the_honest_cost_of_vehicles_is_the_amount_of_the_objective(objective: str) -> None:
-    problem = problem_of(GAME, sampled(), harm_count="honest", objective=objective)
-    last = problem.follow(problem.constant(problem.bounds[:, np.newaxis, :, 1]))
-    assert last.line[:, MOVING].any(axis=1).all() and last.line[:, DROVE].any(axis=1).all()
-    assert problem.value(last) == pytest.approx(amounts(objectives_of(objective, 3), None, last, HONEST)[:, 1])
+    for game, row in ((SHORT, MOVING), (GAME, PUSHED)):
+        problem = problem_of(game, sampled(), harm_count="honest", objective=objective)
+        last = problem.follow(problem.constant(problem.bounds[:, np.newaxis, :, 1]))
+        assert last.line[:, row].any(axis=1).all() and last.line[:, DROVE].any(axis=1).all()
+        assert problem.value(last) == pytest.approx(amounts(objectives_of(objective, 3), None, last, HONEST)[:, 1])
 
 
 def test_extremes__are_better_than_constants() -> None:
