@@ -164,7 +164,7 @@ def pair_amount(line, p, weights):
 
 
 @kernel
-def amount_so_far(line, weights):
+def amount_so_far(line: Floats, weights: Floats) -> float:
     """Harm of one world so far (m2/s2): sum of ``pair_amount`` over all pairs, always from the obstacle to the rear."""
     amount = 0.0
     for p in range(line.shape[1] - 1):
