@@ -6,13 +6,15 @@ total   harm of every impact
 honest  harm of every impact, also where a contact passes it on to another pair, plus a price of conduct: 10 m/s times
         the push, which is closing speed that forces build up and a contact absorbs; 10 m/s times the speed that a
         vehicle's engine gives by driving; ``v^2`` for a vehicle that still moves at v at the horizon, as if it then hit
-        a standing object. The default everywhere
+        a standing object, unless a script prescribes this motion (``episode.step.note_motion``). The default everywhere
 ======  ================================================================================================================
 
 All are in m2/s2 and never fall during an episode. Without the price of conduct, the best braking pushes Vehicle 1 away
-(docs/findings.md). The two vehicles of a pair share harm by their masses; each vehicle alone bears the price of its
-push against the vehicle ahead, of its driving and of its motion. ``register_count`` adds a count. A ``harm_count`` is a
-name or a ``HarmCount``; the functions that users call turn it into a ``HarmCount``, which is then passed along.
+(docs/findings.md). The two vehicles of a pair share harm by their masses; each vehicle alone bears the price of the
+pushes for which it answers (``motion.push``), of its driving and of its motion. All share the price of pushes for which
+nobody answers, so the harm that vehicles bear adds up to that of the line. ``register_count`` adds a count. A
+``harm_count`` is a name or a ``HarmCount``; the functions that users call turn it into a ``HarmCount``, which is then
+passed along.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.layout import DROVE, FIRST, MOVING, PASSED, PUSHED, TOTAL, Floats
+from ethbrake_marl.motion.layout import ANSWERED, DROVE, FIRST, MOVING, PASSED, PUSHED, TOTAL, Floats
 from ethbrake_marl.registry import Registry
 
 COUNTED_ROWS = [FIRST, TOTAL, PASSED, PUSHED, DROVE, MOVING]  # rows of a line that a count can weigh
@@ -130,9 +132,25 @@ def all_counts(*more: HarmCount) -> list[HarmCount]:
 
 @kernel
 def unshared_amount(line, p, weights):
-    """Part of ``pair_amount`` that the pair's rear vehicle bears alone (m2/s2): the price of its conduct."""
+    """Part of ``pair_amount`` that the pair does not share by mass (m2/s2): the price of conduct."""
     pushed, drove = weights[OF_PUSHED] * line[PUSHED, p], weights[OF_DROVE] * line[DROVE, p]
     return pushed + drove + weights[OF_MOVING] * line[MOVING, p]
+
+
+@kernel
+def common_push(line):
+    """Each vehicle's part of the pushes for which nobody answers, in one world so far (m/s)."""
+    rest, vehicles = 0.0, line.shape[1] - 1
+    for p in range(vehicles):
+        rest += line[PUSHED, p] - line[ANSWERED, p]
+    return max(rest, 0.0) / vehicles
+
+
+@kernel
+def conduct_amount(line, p, common, weights):
+    """Price of conduct that the rear vehicle of pair ``p`` bears so far (m2/s2); ``common``: ``common_push``."""
+    pushed = weights[OF_PUSHED] * (line[ANSWERED, p] + common)
+    return pushed + weights[OF_DROVE] * line[DROVE, p] + weights[OF_MOVING] * line[MOVING, p]
 
 
 @kernel
@@ -146,7 +164,7 @@ def pair_amount(line, p, weights):
 
 
 @kernel
-def amount_so_far(line, weights):
+def amount_so_far(line: Floats, weights: Floats) -> float:
     """Harm of one world so far (m2/s2): sum of ``pair_amount`` over all pairs, always from the obstacle to the rear."""
     amount = 0.0
     for p in range(line.shape[1] - 1):
@@ -155,32 +173,33 @@ def amount_so_far(line, weights):
 
 
 @kernel
-def beside_harm(line: Floats, weights: Floats) -> float:
-    """Part of ``amount_so_far`` that is not impact harm (m2/s2): harm passed on and the price of conduct, of one world.
+def cost_of_step(before, line, impact_harm, weights):
+    """Harm of one world in a step (m2/s2): the increase of ``amount_so_far``, which is ``before`` at the step's begin.
 
-    The order of the sum differs from ``amount_so_far``; the last bits of rewards depend on this order.
+    ``impact_harm`` is the harm of the step's impacts alone, which has more digits, in a count without other weights.
     """
-    amount = 0.0
-    for p in range(line.shape[1] - 1):
-        amount += weights[OF_PASSED] * line[PASSED, p] + weights[OF_PUSHED] * line[PUSHED, p]
-        amount += weights[OF_DROVE] * line[DROVE, p] + weights[OF_MOVING] * line[MOVING, p]
-    return amount
+    beside = weights[OF_PASSED] + weights[OF_PUSHED] + weights[OF_DROVE] + weights[OF_MOVING]
+    return amount_so_far(line, weights) - before if beside > 0.0 else impact_harm
 
 
 @large
 def _amounts(line, weights, out):
+    last = out.shape[2] - 1
     for k in range(out.shape[1]):
-        for p in range(out.shape[2]):
+        common = common_push(line[k])
+        for p in range(last):
             out[0, k, p] = pair_amount(line[k], p, weights)
             out[1, k, p] = unshared_amount(line[k], p, weights)
+            out[2, k, p] = conduct_amount(line[k], p, common, weights)
+        out[0, k, last] = out[1, k, last] = out[2, k, last] = 0.0
 
 
 def pair_amounts(line: Floats, count: HarmCount) -> Floats:
-    """Harm of every pair so far, and the part of it that the rear vehicle bears alone, [2, n, N + 1] m2/s2.
+    """Harm of every pair so far, its price of conduct, and the price that its rear vehicle bears, [3, n, N + 1] m2/s2.
 
     ``line`` is an array of a ``State``. Column 0 is the pair with the obstacle. For one pair: ``pair_amount``,
-    ``unshared_amount``.
+    ``unshared_amount``, ``conduct_amount``.
     """
-    out = np.empty((2, len(line), line.shape[2]))
+    out = np.empty((3, len(line), line.shape[2]))
     _amounts(line, count.weights, out)
     return out

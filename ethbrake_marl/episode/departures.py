@@ -27,6 +27,7 @@ from ethbrake_marl.motion.layout import (
     OWN_LATENCY,
     RELEASE_RATE,
     RESTITUTION,
+    SCRIPTED,
     SPEED,
     WEIGHT,
     Bools,
@@ -42,7 +43,7 @@ MAP = "map"  # impacts happen only at decisions
 SHOWN = frozenset({BUILD_UP, OBSTACLE, BACKWARD})  # departures that the arrays of every state show
 
 # Rows of `car` that every feature takes into account, in the order in which digests hash them. Any other row departs
-# where it is not 0.
+# where it is not 0; but SCRIPTED belongs to the game, not to its worlds.
 PLAIN_ROWS = [MASS, LIMIT, LATENCY, BRAKING, DRIVING, BRAKE_RATE, RELEASE_RATE, WEIGHT, RESTITUTION, OWN_LATENCY]
 
 
@@ -76,6 +77,6 @@ def departing_worlds(
     if BACKWARD not in ignored:
         worlds[BACKWARD] = ~(line[:, SPEED, 1:] >= 0.0).all(axis=1)
     for row, name in enumerate(CAR_NAMES):
-        if row not in PLAIN_ROWS:
+        if row not in (*PLAIN_ROWS, SCRIPTED):
             worlds[name] = (car[:, row] != 0.0).any(axis=1)
     return {name: mask for name, mask in worlds.items() if name not in ignored and mask.any()}

@@ -15,9 +15,9 @@ from ethbrake_marl.episode.layer import Layer, agent_through, observe_through, s
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.script_calls import ask_scripts, begin_script
-from ethbrake_marl.episode.state import State, mark, require
+from ethbrake_marl.episode.state import HORIZON, State, mark, require
 from ethbrake_marl.episode.step import Step, StepSettings
-from ethbrake_marl.motion.layout import Floats, Ints
+from ethbrake_marl.motion.layout import SCRIPTED, Floats, Ints
 
 
 class Script(Protocol):
@@ -150,13 +150,17 @@ class Game(NamedTuple):
         return self._replace(layers=(*self.layers, *layers))
 
     def marked(self, alert: State) -> State:
-        """The worlds ``alert``, marked with the departures of this game's physics (``episode.departures``).
+        """The worlds ``alert`` with this game's horizon, scripted vehicles and departures (``episode.departures``).
 
         Raises ``InvalidInput`` for worlds of another physics.
         """
         departures = departures_of(self.physics)
         require(alert, f"scenario {self.name!r}", departures, simulates=True)
-        return mark(alert, departures)
+        car, clock = alert.car.copy(), alert.clock.copy()
+        car[:, SCRIPTED, 1:] = 1.0
+        car[:, SCRIPTED, self.settings.learners] = 0.0
+        clock[:, HORIZON] = self.settings.horizon_s
+        return mark(alert._replace(car=car, clock=clock), departures)
 
     def reset(self, alert: State) -> State:
         """Episodes at their first decision, from worlds at the alert. Scripts decide at the alert.

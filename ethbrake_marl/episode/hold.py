@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.episode.counts import AnyCount, HarmCount, amount_so_far, pair_amount
-from ethbrake_marl.episode.state import State, require
+from ethbrake_marl.episode.state import HORIZON, State, require
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacity
@@ -37,12 +37,13 @@ def hold_worlds(inputs, weights, tie_weights, out):
     Row 0 is the harm in the count with the weights ``weights`` [6], row 1 in the count with ``tie_weights`` [6].
     ``inputs``: ``kernel_inputs``.
     """
-    line, car, wanted, bodies, trials, time, until, memory = inputs
+    line, car, wanted, bodies, trials, time, until, horizon, memory = inputs
     for k in range(trials.shape[0]):
         for j in range(trials.shape[1]):
             failed = hold_world(
-                line[k], car[k], wanted[k], bodies, trials[k, j], time[k], until[k], memory, (weights, math.inf)
-            )
+                line[k], car[k], wanted[k], bodies, trials[k, j], time[k], until[k], horizon[k], memory,
+                (weights, math.inf),
+            )  # fmt: skip
             out[0, k, j] = math.inf if failed else amount_so_far(memory[1], weights)
             out[1, k, j] = math.inf if failed else amount_so_far(memory[1], tie_weights)
 
@@ -64,7 +65,7 @@ def exceeds(line, scratch, limit):
 
 
 @kernel
-def hold_world(line, car, wanted, bodies, trial, time, until, memory, limit):
+def hold_world(line, car, wanted, bodies, trial, time, until, horizon, memory, limit):
     """Write the line at ``until`` to ``memory`` if ``bodies`` hold the commands ``trial`` [B] (m/s2), in one world.
 
     Returns whether the harm exceeds the ``limit`` (``exceeds``), or a check of the physics failed. Other arguments: a
@@ -79,7 +80,8 @@ def hold_world(line, car, wanted, bodies, trial, time, until, memory, limit):
     for b in range(len(bodies)):
         commands[bodies[b]] = trial[b]
     outcome = move_line(line_copy, car, commands, scratch, time, until, exceeds, limit)
-    note_motion(line_copy)
+    if until >= horizon:
+        note_motion(line_copy, car)
     return outcome in (FAILED, STOPPED)
 
 
@@ -104,7 +106,7 @@ def choose_worlds(inputs, weights, best, least):
     the M possible states of a world. Harm never falls, so the search ends once ``least`` is the harm so far, and what
     can only be worse is not simulated.
     """
-    line, car, wanted, bodies, trials, time, until, memory = inputs
+    line, car, wanted, bodies, trials, time, until, horizon, memory = inputs
     M = len(line) // len(least)
     for k in range(len(least)):
         states, so_far = range(k * M, (k + 1) * M), 0.0
@@ -121,8 +123,9 @@ def choose_worlds(inputs, weights, best, least):
                     break
                 limit = weights, least[k]
                 worse = hold_world(
-                    line[row], car[row], wanted[row], bodies, trials[row, j], time[row], until[row], memory, limit
-                )
+                    line[row], car[row], wanted[row], bodies, trials[row, j], time[row], until[row], horizon[row],
+                    memory, limit,
+                )  # fmt: skip
                 largest = max(largest, math.inf if worse else amount_so_far(memory[1], weights))
             if largest < least[k]:
                 best[k], least[k] = j, largest
@@ -135,7 +138,7 @@ def descend_worlds(inputs, shares, rounds, weights, best, least):
     ``inputs``: ``kernel_inputs``, of which the trials, [1, C, 1] for C ``shares``, are working memory, as is ``best``
     [1].
     """
-    line, car, wanted, bodies, trials, time, until, memory = inputs
+    line, car, wanted, bodies, trials, time, until, horizon, memory = inputs
     for k in range(len(least)):
         least[k] = 0.0
         for i in range(wanted.shape[1]):
@@ -145,7 +148,8 @@ def descend_worlds(inputs, shares, rounds, weights, best, least):
             for j in range(len(shares)):
                 trials[0, j, 0] = -capacity(car[k], BRAKING, bodies[b]) * shares[j]
             best[0], least[k], row = 0, math.inf, slice(k, k + 1)
-            world = line[row], car[row], wanted[row], bodies[b : b + 1], trials, time[row], until[row], memory
+            moments = time[row], until[row], horizon[row]
+            world = line[row], car[row], wanted[row], bodies[b : b + 1], trials, *moments, memory
             choose_worlds(world, weights, best, least[row])
             wanted[k, bodies[b]] = trials[0, best[0], 0]
 
@@ -190,14 +194,15 @@ def kernel_inputs(
     """Trials as the kernels need them. Raises ``InvalidInput`` for worlds of another physics.
 
     Each of C trials starts from ``line``: ``bodies`` [B] hold the commands ``trials`` [n, C, B] (m/s2), all others hold
-    ``wanted``, from ``time`` to ``until`` (s, [n] each). ``line``, ``car`` and ``wanted`` are arrays of a ``State``.
-    ``memory`` is working memory: scratch of the physics, one line, and the commands of this line.
+    ``wanted``, from ``time`` to ``until`` (s, [n] each). Motion then has a price, unless it is before the ``horizon``
+    (s, [n]). ``line``, ``car`` and ``wanted`` are arrays of a ``State``. ``memory`` is working memory: scratch of the
+    physics, one line, and the commands of this line.
     """
     features = "e_v2x_bm other than pairwise, shields other than episode:pairwise"
     require(state, f"a plan of constant commands ({features})", simulates=True)
     until, bodies = np.full(state.n, until_s, np.float64), np.asarray(bodies, np.int64)
-    time, trials = state.time_s.copy(), np.ascontiguousarray(trials)
-    return state.line, state.car, wanted, bodies, trials, time, until, memory_for(wanted.shape[1])
+    time, horizon, trials = state.time_s.copy(), state.clock[:, HORIZON].copy(), np.ascontiguousarray(trials)
+    return state.line, state.car, wanted, bodies, trials, time, until, horizon, memory_for(wanted.shape[1])
 
 
 def memory_for(bodies: int) -> tuple[Floats, Floats, Floats]:

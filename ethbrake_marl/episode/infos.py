@@ -10,6 +10,7 @@ total_harm                harm that the vehicle has borne so far, all impacts, m
 world_first_impact_harm   harm of the whole line so far, first impact of each pair, m2/s2
 world_total_harm          harm of the whole line so far, all impacts, m2/s2
 collided                  whether the world has had an impact
+cut                       whether the episode was truncated before the horizon; later harm and motion then cost nothing
 cost                      harm of the line in the last step, in the reward's count, m2/s2
 reward_NAME               term NAME in the last step, without its weight, if the reward or ``report`` has it
 world_seed, world         seed and number of the world; -1 and -1 for a world made by the caller
@@ -27,16 +28,17 @@ import numpy as np
 from ethbrake_marl.episode.commands import action_of
 from ethbrake_marl.episode.counts import ALL_IMPACTS, FIRST_IMPACTS, amount_so_far
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import FIRST_IN_LIST, NUMBER, TIME, State, split_world
-from ethbrake_marl.episode.step import Step
+from ethbrake_marl.episode.state import ENDED, FIRST_IN_LIST, HORIZON, NUMBER, TIME, State, split_world
+from ethbrake_marl.episode.step import Step, stands
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import FIRST, FORCE, IMPACTS, MASS, TOTAL, Floats, Ints
 
 # rows of `out`
 (
-    TIME_NOW, FORCE_NOW, BORNE_FIRST, BORNE_TOTAL, LINE_FIRST, LINE_TOTAL, COLLIDED, COMMAND, ACTION, LISTED, WORLD,
-) = range(11)  # fmt: skip
-OUT_ROWS = 11
+    TIME_NOW, FORCE_NOW, BORNE_FIRST, BORNE_TOTAL, LINE_FIRST, LINE_TOTAL, COLLIDED, COMMAND, ACTION, CUT, LISTED,
+    WORLD,
+) = range(12)  # fmt: skip
+OUT_ROWS = 12
 FIRST_WEIGHTS, TOTAL_WEIGHTS = FIRST_IMPACTS.weights, ALL_IMPACTS.weights
 
 
@@ -52,6 +54,7 @@ def report(line, car, clock, wanted, bodies, borne, out):
         first, total = amount_so_far(line[k], FIRST_WEIGHTS), amount_so_far(line[k], TOTAL_WEIGHTS)
         impacts, number = 0.0, clock[k, NUMBER]
         listed = number <= FIRST_IN_LIST
+        cut = clock[k, ENDED] == 1.0 and clock[k, TIME] < clock[k, HORIZON] and not stands(line[k], wanted[k])
         for p in range(line.shape[2] - 1):
             impacts += line[k, IMPACTS, p]
         for o in range(len(bodies)):
@@ -60,7 +63,7 @@ def report(line, car, clock, wanted, bodies, borne, out):
             info[TIME_NOW], info[FORCE_NOW], info[COLLIDED] = time, line[k, FORCE, i], 1.0 if impacts > 0.0 else 0.0
             info[BORNE_FIRST], info[BORNE_TOTAL] = borne[0, i - 1], borne[1, i - 1]
             info[LINE_FIRST], info[LINE_TOTAL] = first, total
-            info[COMMAND], info[ACTION] = command, action_of(car[k], i, command)
+            info[COMMAND], info[ACTION], info[CUT] = command, action_of(car[k], i, command), 1.0 if cut else 0.0
             info[WORLD], info[LISTED] = FIRST_IN_LIST - number if listed else number, 1.0 if listed else 0.0
 
 
@@ -76,7 +79,7 @@ def named(values: Any, world: Any, cost: Any, seed: Any) -> dict[str, Any]:
 
     ``values``: the rows of ``numbers`` before the last one, ``WORLD``. ``world``: number of the world, a whole number.
     """
-    time, force, borne_first, borne_total, line_first, line_total, collided, command, action, listed = values
+    time, force, borne_first, borne_total, line_first, line_total, collided, command, action, cut, listed = values
     return {
         "time_s": time,
         "command_in_force_mps2": force,
@@ -87,6 +90,7 @@ def named(values: Any, world: Any, cost: Any, seed: Any) -> dict[str, Any]:
         "collided": collided == 1.0,
         "chosen_command_mps2": command,
         "chosen_action": action,
+        "cut": cut == 1.0,
         "cost": cost,
         "world_seed": seed,
         "world": world,

@@ -60,15 +60,15 @@ class Harm(NamedTuple):
     def of(cls, amounts: Floats, car: Floats) -> Harm:
         """Harm of pairs, vehicles and line, from ``pair_amounts`` and the parameters ``car`` of a ``State``.
 
-        The rear vehicle of a pair alone bears the price of its conduct; the pair shares the rest of its harm by mass.
+        Each vehicle bears the price of its conduct; a pair shares the rest of its harm by mass.
         """
-        pairs, unshared = amounts
+        pairs, unshared, conduct = amounts
         line_harm, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
         for p in range(pairs.shape[1]):  # from the obstacle to the rear
             line_harm = line_harm + pairs[:, p]
         impacts = np.maximum(pairs - unshared, 0.0)
         split_harm(impacts, car[:, MASS], borne)
-        return cls(impacts, borne + unshared[:, :-1], line_harm, car)
+        return cls(impacts, borne + conduct[:, :-1], line_harm, car)
 
     def weighted(self, weights: Floats) -> Floats:
         """Weighted harm ``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, with ``weights`` w [n, N].

@@ -13,7 +13,7 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import COUNTED_ROWS
 from ethbrake_marl.episode.hold import descend_worlds, memory_for
-from ethbrake_marl.episode.state import END, ENDED, TIME, State, require
+from ethbrake_marl.episode.state import END, ENDED, HORIZON, TIME, State, require
 from ethbrake_marl.episode.step import StepSettings
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import Floats
@@ -39,8 +39,9 @@ def shape_worlds(line, car, clock, learners, shares, rounds, weights, working, d
                     present[0, row, i] = line[k, row, i]
                 for row in COUNTED:
                     present[0, row, i] = 0.0
-            moments[0], moments[1] = clock[k, TIME], clock[k, END]
-            world = present, car[k : k + 1], commands, learners, trials, moments[:1], moments[1:], memory
+            moments[0], moments[1], moments[2] = clock[k, TIME], clock[k, END], clock[k, HORIZON]
+            times = moments[:1], moments[1:2], moments[2:]
+            world = present, car[k : k + 1], commands, learners, trials, *times, memory
             descend_worlds(world, shares, rounds, weights, best, harm)
         potentials[k] = -harm[0]
         for body in learners:
@@ -67,7 +68,7 @@ def _shaped(settings: StepSettings, discount: float, before: Floats, state: Stat
     # With one learner only the least harm counts: full braking comes first, which often does no more harm.
     shares, rounds = (STRONGEST_FIRST, 1) if len(learners) == 1 else (BRAKING_SHARES, 2)
     working = (
-        np.empty((1, rows, bodies)), np.empty((1, bodies)), np.empty((1, len(shares), 1)), np.empty(2), np.empty(1),
+        np.empty((1, rows, bodies)), np.empty((1, bodies)), np.empty((1, len(shares), 1)), np.empty(3), np.empty(1),
         np.zeros(1, np.int64), memory_for(bodies),
     )  # fmt: skip
     value, potentials = np.zeros((state.n, bodies - 1)), np.empty(state.n)

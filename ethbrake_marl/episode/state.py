@@ -37,9 +37,10 @@ LAST = 3  # number of the last step, unless all vehicles come to rest before
 ENDED = 4  # 1 once the episode has ended
 NUMBER = 5  # number of the world in its list; -1: the caller has made it
 END = 6  # time at which the last step ends (s): the horizon, or earlier after `StepSettings.most_steps`
+HORIZON = 7  # the game's horizon (s), at which motion has a price
+KEY = 8  # key of the world's random generators
 FIRST_IN_LIST = -2  # NUMBER of world 0 of an evaluation list that a reset asked for; the next ones are -3, -4, ...
-KEY = 7  # key of the world's random generators
-CLOCK_COLUMNS = 8
+CLOCK_COLUMNS = 9
 
 
 class State(NamedTuple):
@@ -210,10 +211,11 @@ class State(NamedTuple):
         return pair_amounts(self.line, self._defined(harm_count))[0, :, 1:-1]
 
     def borne_harm(self, harm_count: AnyCount = HONEST) -> Floats:
-        """Harm that each vehicle has borne so far, [n, N] m2/s2. The two shares of a pair sum to the pair's harm."""
-        (pairs, unshared), out = pair_amounts(self.line, self._defined(harm_count)), np.empty((self.n, self.vehicles))
+        """Harm that each vehicle has borne so far, [n, N] m2/s2. It sums to the harm of the line."""
+        pairs, unshared, conduct = pair_amounts(self.line, self._defined(harm_count))
+        out = np.empty((self.n, self.vehicles))
         split_harm(pairs - unshared, self.car[:, MASS], out)
-        return out + unshared[:, :-1]
+        return out + conduct[:, :-1]
 
     @property
     def departures(self) -> frozenset[str]:

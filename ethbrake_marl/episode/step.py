@@ -9,9 +9,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.commands import LARGEST_ACTION, action_array, check_actions, write_commands
-from ethbrake_marl.episode.counts import HONEST, OF_FIRST, OF_TOTAL, HarmCount, beside_harm
+from ethbrake_marl.episode.counts import HONEST, OF_FIRST, OF_TOTAL, HarmCount, amount_so_far, cost_of_step
 from ethbrake_marl.episode.script_calls import ask_scripts
-from ethbrake_marl.episode.state import CLOCK_COLUMNS, END, ENDED, FIRST_DECISION, LAST, NUMBER, STEPS, TIME, State
+from ethbrake_marl.episode.state import (
+    CLOCK_COLUMNS,
+    END,
+    ENDED,
+    FIRST_DECISION,
+    HORIZON,
+    LAST,
+    NUMBER,
+    STEPS,
+    TIME,
+    State,
+)
 from ethbrake_marl.episode.threads import call_slices
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
@@ -23,6 +34,7 @@ from ethbrake_marl.motion.layout import (
     MOVING,
     NEW_FIRST,
     NEW_TOTAL,
+    SCRIPTED,
     SPEED,
     Bools,
     Floats,
@@ -51,7 +63,7 @@ class StepSettings(NamedTuple):
     harm: float = 1.0  # weight of the line's harm in the reward
     terminal: float = 0.0  # weight of an end without impact in the reward
     harm_count: HarmCount = HONEST  # of harm in the reward (``episode.counts``)
-    most_steps: float = np.inf  # number of steps after which an episode is truncated, as at the horizon
+    most_steps: float = np.inf  # number of steps after which an episode is truncated, at no price of motion
     threads: int = 1  # that advance slices of many worlds at once (``episode.threads``)
 
 
@@ -184,7 +196,7 @@ def step_rows(
         if clock[k, ENDED] == 1.0:
             continue
         write_commands(car[k], wanted[k], learners, actions[k])
-        before = beside_harm(line[k], weights)
+        before = amount_so_far(line[k], weights)
         outcome, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
         if outcome == FAILED:
             failed = k
@@ -199,7 +211,7 @@ def step_rows(
         out[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
         out[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
         impact_harm = weights[OF_FIRST] * out[FIRST_HARM, k] + weights[OF_TOTAL] * out[TOTAL_HARM, k]
-        cost = impact_harm + (beside_harm(line[k], weights) - before)
+        cost = cost_of_step(before, line[k], impact_harm, weights)
         shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * cost
         out[COST, k] = cost
         for i in range(bodies - 1):
@@ -234,8 +246,8 @@ def advance(line, car, clock, wanted, scratch, time_step_s):
     clock[TIME] = until
     at_rest = outcome != FAILED and stands(line, wanted)
     clock[ENDED] = 1.0 if over or at_rest or outcome == FAILED else 0.0
-    if over:
-        note_motion(line)
+    if over and clock[END] >= clock[HORIZON]:
+        note_motion(line, car)
     return outcome, at_rest
 
 
@@ -249,10 +261,19 @@ def stands(line, wanted):
 
 
 @kernel
-def note_motion(line):
-    """Store the square of each vehicle's present speed (m2/s2) in the row MOVING of one world's ``line``."""
+def note_motion(line, car):
+    """Store what each vehicle's present motion costs (m2/s2) in the row MOVING of one world's ``line``.
+
+    The cost is ``max(v^2 - s^2, 0)``, with the speed v of the vehicle and the forward speed s of the nearest scripted
+    vehicle ahead (0: there is none). The motion of a scripted vehicle costs nothing.
+    """
+    prescribed = 0.0
     for i in range(1, line.shape[1]):
-        line[MOVING, i - 1] = line[SPEED, i] * line[SPEED, i]
+        squared = line[SPEED, i] * line[SPEED, i]
+        if car[SCRIPTED, i] == 1.0:
+            line[MOVING, i - 1], prescribed = 0.0, squared if line[SPEED, i] > 0.0 else 0.0
+        else:
+            line[MOVING, i - 1] = max(squared - prescribed, 0.0)
 
 
 def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:

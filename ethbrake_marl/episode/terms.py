@@ -12,7 +12,7 @@ jerk          minus the squared rate of change of the vehicle's force
 terminal      1 at the end of an episode without any impact
 push          minus the push of all contacts of the line (``motion.push``)
 drove         minus the speed that the vehicle's engine alone gives it (``motion.forces.driving``)
-still_moving  -1 if the episode ends at the horizon with a vehicle in motion
+still_moving  -1 if the episode ends at the horizon with a vehicle whose motion has a price
 shaping       for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
               the learners can reach (``episode.shaping``)
 harm_K        minus the harm that vehicle_K bears
@@ -39,7 +39,7 @@ from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import TRUNCATED, Step
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
-from ethbrake_marl.motion.layout import DROVE, PUSHED, TOTAL, Floats
+from ethbrake_marl.motion.layout import DROVE, MOVING, PUSHED, TOTAL, Floats
 from ethbrake_marl.registry import Registry
 
 TermFunction = Callable[[State, Step, State], Floats]
@@ -96,7 +96,7 @@ BUILT_IN = {  # name -> (unit, meaning)
     "terminal": ("1", "1 at the end of an episode without any impact"),
     "push": ("m/s", "minus the push of all contacts of the line"),
     "drove": ("m/s", "minus the speed that the vehicle's engine alone gives"),
-    "still_moving": ("1", "-1 for an end at the horizon with a vehicle in motion"),
+    "still_moving": ("1", "-1 for an end at the horizon with a vehicle whose motion has a price"),
     "shaping": ("m2/s2", "discounted potential after the step minus the potential before it"),
 }
 
@@ -153,9 +153,9 @@ def drove(before: State, step: Step, after: State) -> Floats:
 
 
 def still_moving(before: State, step: Step, after: State) -> Floats:
-    """Term still_moving, [n]: -1 if the step ends at the horizon with a vehicle in motion, otherwise 0."""
+    """Term still_moving, [n]: -1 if the step ends at the horizon with motion that has a price, otherwise 0."""
     require(before, "the term still_moving", simulates=True)
-    return 0.0 - step.out[TRUNCATED] * after.moving
+    return 0.0 - step.out[TRUNCATED] * after.line[:, MOVING].any(axis=1)
 
 
 def growth(objectives: Sequence[Objective], count: HarmCount, before: State, step: Step, after: State) -> Floats:

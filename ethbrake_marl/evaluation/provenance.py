@@ -14,7 +14,7 @@ import numpy as np
 from ethbrake_marl.episode.departures import PLAIN_ROWS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.files.python_file import files_run
-from ethbrake_marl.motion.layout import CAR_NAMES, FIRST, FORCE, GAP, HIT, IMPACTS, SPEED, TOTAL
+from ethbrake_marl.motion.layout import CAR_NAMES, FIRST, FORCE, GAP, HIT, IMPACTS, SCRIPTED, SPEED, TOTAL
 from ethbrake_marl.registry import versions_used
 
 EVALUATION_PACKAGES = ("ethbrake-marl", "numba", "numpy")
@@ -31,7 +31,7 @@ def worlds_sha256(worlds: State) -> str:
     digest, arrays = hashlib.sha256(), [worlds.line[:, MOTION], worlds.car[:, PLAIN_ROWS], worlds.know, worlds.wanted]
     for name in sorted(CAR_NAMES):
         further = worlds.car[:, CAR_NAMES.index(name)]
-        if CAR_NAMES.index(name) not in PLAIN_ROWS and further.any():
+        if CAR_NAMES.index(name) not in (*PLAIN_ROWS, SCRIPTED) and further.any():
             digest.update(name.encode())
             arrays.append(further)
     for array in arrays:

@@ -64,7 +64,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
             ``paper-reward``, a mapping of settings, or ``RewardParams``. Under ``harm`` pushing is free.
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
-        max_cycles: number of steps after which an episode is truncated, as at a horizon; None: only at the horizon.
+        max_cycles: number of steps after which an episode is truncated (info ``cut``); None: only at the horizon.
         actions: form of actions. None: numbers in [-1, 1]. K >= 2: indices of K evenly spaced numbers.
         reward_vector: components of array rewards, ``vehicles`` or a list of names (``episode.terms``); None: rewards
             are numbers.

@@ -14,6 +14,7 @@ from ethbrake_marl.motion.compiling import kernel, large, part
 from ethbrake_marl.motion.layout import (
     ACTIVE,
     BRAKE_RATE,
+    BRAKING,
     COMMAND,
     FORCE,
     FORCE_GOAL,
@@ -23,6 +24,7 @@ from ethbrake_marl.motion.layout import (
     Floats,
 )
 
+FULL_MPS2 = 1e-5  # a command this near to the braking capacity is full braking: searches round commands
 ROUNDING_S = 1e-9  # an onset this shortly before the end of an interval is at its end
 
 
@@ -72,6 +74,12 @@ def capacity(car, row, i):
 def capacities(car: Floats, row: int) -> Floats:
     """Largest deceleration (``row`` BRAKING) or forward acceleration (DRIVING) of all bodies, [n, N + 1] m/s2."""
     return car[:, row]
+
+
+@kernel
+def brakes_fully(car, scratch, i):
+    """Whether a command of full braking is in effect for body i: its brakes have or build up all their force."""
+    return scratch[ACTIVE, i] == 1.0 and scratch[COMMAND, i] <= FULL_MPS2 - capacity(car, BRAKING, i)
 
 
 @kernel

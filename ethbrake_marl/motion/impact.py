@@ -17,8 +17,9 @@ from __future__ import annotations
 import math
 
 from ethbrake_marl.motion.compiling import kernel, part
-from ethbrake_marl.motion.forces import settle
+from ethbrake_marl.motion.forces import brakes_fully, settle
 from ethbrake_marl.motion.layout import (
+    ANSWERED,
     BEFORE,
     BLOCK_HEAD,
     BLOCK_HIGH,
@@ -143,16 +144,18 @@ def resolve_cluster(line, car, scratch, first, last):
 
 
 @part
-def note_thrown(line, scratch, p):
+def note_thrown(line, car, scratch, p):
     """Add the change of pair p's closing speed in an impact to the row THROWN; the pair has had an impact before.
 
     If pair p itself closes in this impact, a part of the change takes up closing speed that forces had built up. This
-    part is added to the row PUSHED.
+    part is added to the row PUSHED, and the rear vehicle answers for it (row ANSWERED), unless it brakes fully.
     """
     change = (line[SPEED, p + 1] - scratch[BEFORE, p + 1]) - (line[SPEED, p] - scratch[BEFORE, p])
     closing = scratch[CLOSING, p]
     if closing > max(TOUCH_MPS, line[THROWN, p]):
-        line[PUSHED, p] -= change * min((closing - line[THROWN, p]) / closing, 1.0)
+        push = -change * min((closing - line[THROWN, p]) / closing, 1.0)
+        line[PUSHED, p] += push
+        line[ANSWERED, p] += 0.0 if brakes_fully(car, scratch, p + 1) else push
     line[THROWN, p] += change
 
 
@@ -254,7 +257,7 @@ def resolve_impacts(line, car, scratch, now, ahead):
     for p in range(ahead, pairs):
         scratch[CONTACT_SPEED, p] = 0.0
         if line[HIT, p] == 1.0:
-            note_thrown(line, scratch, p)
+            note_thrown(line, car, scratch, p)
         if scratch[CLOSING, p] > TOUCH_MPS:
             harm = scratch[CLOSING, p] * scratch[CLOSING, p]
             scratch[NEW_TOTAL, p] += harm

@@ -4,9 +4,9 @@ Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, f
 In a row of pairs, column p is the pair (body p, body p + 1). Column 0 exists in every world: without an obstacle its
 gap is ``FAR_M``, and the physics leaves it out.
 
-Arrays that most functions share: ``line`` [12, N + 1] changes, ``car`` [10, N + 1] stays the same, ``scratch`` [38, N +
-1] is the working memory of one call. A batch of n worlds has one more axis in front: ``line`` [n, 12, N + 1], ``car``
-[n, 10, N + 1].
+Arrays that most functions share: ``line`` [13, N + 1] changes, ``car`` [11, N + 1] stays the same, ``scratch`` [38, N +
+1] is the working memory of one call. A batch of n worlds has one more axis in front: ``line`` [n, 13, N + 1], ``car``
+[n, 11, N + 1].
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ DROVE = 8  # of the pair's rear vehicle: speed that its engine alone would have 
 MOVING = 9  # of the pair's rear vehicle: square of its speed at the horizon (m2/s2)
 THROWN = 10  # change of the closing speed by impacts since the pair last touched (m/s)
 PASSED = 11  # harm that the contact passes on in impacts, beyond the harm of its own closing speed (m2/s2)
-LINE_ROWS = 12
+ANSWERED = 12  # of the pair's rear vehicle: part of all pushes for which this vehicle answers (m/s)
+LINE_ROWS = 13
 
 # rows of `car`
 MASS = 0  # t; infinite: the obstacle
@@ -44,9 +45,10 @@ RELEASE_RATE = 6  # rate at which the force rises towards the command (m/s3); in
 WEIGHT = 7  # weight of the vehicle's harm in the objective `preference`
 RESTITUTION = 8  # of every impact of the world, in all columns (1)
 OWN_LATENCY = 9  # latency without the wait for news of the alert (s)
+SCRIPTED = 10  # 1: a script drives the vehicle in this game (`Game.marked`)
 CAR_NAMES = (
     *("mass", "speed limit", "latency", "braking capacity", "driving capacity"),
-    *("brake rate", "release rate", "harm weight", "restitution", "own latency"),
+    *("brake rate", "release rate", "harm weight", "restitution", "own latency", "scripted"),
 )  # of these rows, in their order
 CAR_ROWS = len(CAR_NAMES)
 

@@ -14,6 +14,12 @@ u_front the smallest of the mean accelerations of the bodies i to p (for every i
 move as one with the pair count. For two moving vehicles the push is the integral of ``u_{p+1} - u_p``. A part that its
 brakes hold at rest has the acceleration 0, and so has the obstacle with the vehicles that touch it.
 
+Who answers for the push: the rear vehicle of the pair for what its own force adds, ``max(u_own - u_front, 0)``, where
+u_own is its acceleration by its own force. Those behind it whose force presses on it answer for the rest: the bodies j
+with u_j above both u_own and u_front, up to the one with which the mean is u_rear, in proportion to mass times excess
+at the middle of the time between two events. A body that brakes with all it has answers for nothing; what
+nobody answers for belongs to all vehicles alike.
+
 Between two events each mean is a linear function of time, so the largest of them is piecewise linear and convex, and
 the integral is exact.
 """
@@ -23,8 +29,21 @@ from __future__ import annotations
 import math
 
 from ethbrake_marl.motion.compiling import kernel, part
+from ethbrake_marl.motion.forces import brakes_fully
 from ethbrake_marl.motion.impact import SAME_MPS2
-from ethbrake_marl.motion.layout import ACCELERATION, HIGH, JERK, JOINED, LOW, LOW_JERK, MASS, PART, PART_RATE, PUSHED
+from ethbrake_marl.motion.layout import (
+    ACCELERATION,
+    ANSWERED,
+    HIGH,
+    JERK,
+    JOINED,
+    LOW,
+    LOW_JERK,
+    MASS,
+    PART,
+    PART_RATE,
+    PUSHED,
+)
 
 
 @kernel
@@ -90,9 +109,82 @@ def gain(car, scratch, body, last, toward, side, side_jerk, held, duration):
     return toward * integral_of_largest(scratch[PART], scratch[PART_RATE], count, duration)
 
 
+@part
+def own_push(car, scratch, p, head, side, front, held, duration):
+    """Push (m/s) of pair p that the force of its rear body adds in ``duration`` (s).
+
+    ``side`` and ``front`` are the rows of ``scratch`` with the accelerations by own forces of the bodies behind and in
+    front of the contact. ``head`` is the front body of those that move as one; other arguments as for ``gain``.
+    """
+    jerks = LOW_JERK - LOW
+    own, rate = scratch[side, p + 1], scratch[side + jerks, p + 1]
+    if held:  # u_own is at least 0, u_front at most
+        scratch[PART, 0], scratch[PART_RATE, 0], scratch[PART, 1], scratch[PART_RATE, 1] = own, rate, 0.0, 0.0
+        pressing = integral_of_largest(scratch[PART], scratch[PART_RATE], 2, duration)
+        return pressing - gain(car, scratch, p, head, -1, front, front + jerks, True, duration)
+    gain(car, scratch, p, head, -1, front, front + jerks, False, duration)  # PART: minus the means of the bodies i to p
+    count = p - head + 1
+    for k in range(count):
+        scratch[PART, k] += own
+        scratch[PART_RATE, k] += rate
+    scratch[PART, count], scratch[PART_RATE, count] = 0.0, 0.0
+    return integral_of_largest(scratch[PART], scratch[PART_RATE], count + 1, duration)
+
+
+@kernel
+def largest_mean(car, scratch, body, last, toward, side, time):
+    """Largest mean acceleration (m/s2) of the bodies from ``body`` to j after ``time`` (s), and this j.
+
+    Arguments: as for ``group_acceleration``; where ``toward`` is -1, the result is minus the smallest mean.
+    """
+    most, mass, force, best = -math.inf, 0.0, 0.0, body
+    for i in range(body, last + toward, toward):
+        if car[MASS, i] == math.inf:
+            break
+        mass += car[MASS, i]
+        force += toward * car[MASS, i] * (scratch[side, i] + scratch[side + LOW_JERK - LOW, i] * time)
+        if force / mass > most:
+            most, best = force / mass, i
+    return most, best
+
+
+@kernel
+def excess(car, scratch, j, side, time, level):
+    """Mass times acceleration by own force above ``level`` (m/s2) of body j after ``time`` (s)."""
+    own = scratch[side, j] + scratch[side + LOW_JERK - LOW, j] * time
+    return car[MASS, j] * max(own - level, 0.0)
+
+
+@part
+def note_answers(line, car, scratch, p, head, tail, side, front, held, duration, push):
+    """Add the parts of pair p's ``push`` (m/s) for which vehicles answer to the row ANSWERED of ``line``.
+
+    ``tail`` is the last body of those that move as one. Other arguments: as for ``own_push``.
+    """
+    rear = p + 1
+    part_of_rear = min(own_push(car, scratch, p, head, side, front, held, duration), push)
+    rest, pressing, time, level, last = push - part_of_rear, 0.0, 0.0, 0.0, rear
+    if not brakes_fully(car, scratch, rear):
+        line[ANSWERED, p] += part_of_rear
+    for attempt in range(3):  # at the middle; if nobody else presses then, at the end, or at the beginning
+        if pressing == 0.0 and rest > 0.0:
+            time = duration * (0.5, 1.0, 0.0)[attempt]
+            level = scratch[side, rear] + scratch[side + LOW_JERK - LOW, rear] * time
+            level = max(level, 0.0 if held else -largest_mean(car, scratch, p, head, -1, front, time)[0])
+            last = largest_mean(car, scratch, rear, tail, 1, side, time)[1]
+            for j in range(rear + 1, last + 1):
+                pressing += excess(car, scratch, j, side, time, level)
+    for j in range(rear + 1, last + 1):
+        if pressing > 0.0 and not brakes_fully(car, scratch, j):
+            line[ANSWERED, j - 1] += rest * (excess(car, scratch, j, side, time, level) / pressing)
+
+
 @kernel
 def add_push(line, car, scratch, duration, ahead, builds):
-    """Add the push of every pair in ``duration`` (s) to the row PUSHED of ``line``. No event happens in this time."""
+    """Add the push of every pair in ``duration`` (s) to the row PUSHED of ``line``, and who answers for it to ANSWERED.
+
+    No event happens in this time.
+    """
     pairs, head = line.shape[1] - 1, ahead
     for p in range(ahead, pairs):
         if scratch[JOINED, p] == 0.0:
@@ -114,3 +206,4 @@ def add_push(line, car, scratch, duration, ahead, builds):
             push *= duration
         if push > SAME_MPS2 * duration:  # less is rounding
             line[PUSHED, p] += push
+            note_answers(line, car, scratch, p, head, tail, behind, front, held, duration, push)

@@ -42,7 +42,9 @@ def test_push__is_the_push_of_the_step_of_all_pairs() -> None:
     assert paid({"harm": 0.0, "push": 1.0}, against, later(against, [3.0, 2.0], 1.0)).terms["push"] == near(-5.0)
 
 
-@pytest.mark.parametrize(("scenario", "action", "ends"), [(CRASH, 0.0, [-1.0]), (REST, -1.0, [])])
+@pytest.mark.parametrize(
+    ("scenario", "action", "ends"), [(CRASH.replace(horizon_s=0.9), 0.0, [-1.0]), (REST, -1.0, [])]
+)
 def test_still_moving__is_paid_once_at_the_horizon(scenario: Any, action: float, ends: list[float]) -> None:
     _, game = open_game(scenario, reward={"harm": 0.0, "still_moving": 2.0})
     state, values = game.reset(game.draw(1, 0, 0)), list[float]()

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agent_names import make_agent, open_game
 from ethbrake_marl.episode.counts import COUNTED_ROWS, COUNTS, EXACT_IMPACTS, HONEST, HarmCount, pair_amounts
 from ethbrake_marl.episode.game import Game
@@ -16,7 +17,7 @@ from ethbrake_marl.episode.play import follow_plans, price
 from ethbrake_marl.episode.reward import RewardParams, reward_params
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.evaluate import evaluate
-from ethbrake_marl.motion.layout import BRAKING, DRIVING, DROVE, MOVING, PUSHED
+from ethbrake_marl.motion.layout import ANSWERED, BRAKING, DRIVING, DROVE, MOVING, PUSHED
 from ethbrake_marl.shields.step import StepShield
 from tests.contract.interfaces import CRASH, REST
 from tests.episode.lines import later, state_of
@@ -33,11 +34,12 @@ def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_h
     # Coasting, Vehicle 2 hits with 6 m/s at 1 s: 18.5 m/s in common. Vehicle 1 of 1 t brakes with 6 m/s2 against the
     # 3 t behind it for 0.3 s: a push of 1.8 m/s, and 18.5 - 0.3 x 1.5 = 18.05 m/s of both at the horizon.
     # Of the impact Vehicle 1 bears 3/4; Vehicle 2 bears the price of its push, each that of its own motion.
-    _, game = open_game(CRASH, reward="honest", reward_vector="vehicles")
+    scenario = CRASH.replace(obstacle_gap_m=1000)
+    _, game = open_game(scenario, learners=["vehicle_1", "vehicle_2"], reward="honest", reward_vector="vehicles")
     state, counted, borne = game.reset(game.draw(1, 0, 0)), 0.0, np.zeros(2)
     while not state.ended[0]:
         assert not state.line[:, MOVING].any()
-        state, step = game.step(state, np.zeros((1, 1)))
+        state, step = game.step(state, np.array([[-1.0, 0.0]]))
         counted += step.cost[0]
         assert step.vector is not None
         borne -= step.vector[0, 0]
@@ -50,6 +52,28 @@ def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_h
     expected = [0.75 * 36.0 + 18.05**2, 0.25 * 36.0 + 10 * 1.8 + 18.05**2]
     assert state.borne_harm("honest")[0].tolist() == near(expected) and borne.tolist() == near(expected)
     assert amounts(objectives_of("own", 2), None, state, HONEST)[0].tolist() == near(expected)
+
+
+@pytest.mark.parametrize(("scripts", "moving"), [
+    ({1: "coast"}, [0.0, 12.0**2 - 10.0**2, 0.0]),  # Vehicle 3 is slower than the script ahead
+    ({}, [10.0**2, 12.0**2, 9.0**2]),
+    ({2: "coast"}, [10.0**2, 0.0, 0.0]),
+    ({1: "full_brake"}, [0.0, 12.0**2 - 2.2**2, 9.0**2 - 2.2**2]),  # with 6 m/s2 for 1.3 s
+    ({1: "coast", 2: "coast", 3: "coast"}, [0.0] * 3),
+    ({3: "coast"}, [10.0**2, 12.0**2, 0.0]),
+])  # fmt: skip
+def test_motion_at_the_horizon__costs_what_no_script_prescribes(scripts: dict[int, str], moving: list[float]) -> None:
+    roles = {f"vehicle_{i}": scripts.get(i, "learner") for i in (1, 2, 3)}
+    scenario = eb.Scenario(
+        name="apart", vehicles=3, gaps_m=50, speeds_mps=[10, 12, 9], braking_capacity_mps2=6, driving_capacity_mps2=6,
+        mass_t=1, latency_s=0, horizon_s=1.3, roles=roles, obstacle_gap_m=1000,
+    )  # fmt: skip
+    _, game = open_game(scenario)
+    state = game.reset(scenario.sample(1, seed=7))
+    coasting = np.zeros((1, 1, 3 - len(scripts)))
+    last, cost = follow_plans(game, state, coasting, HONEST)
+    assert last.line[0, MOVING].tolist() == near([*moving, 0.0]) and cost.tolist() == near([sum(moving)])
+    assert last.departures == {"obstacle"}
 
 
 def test_honest__adds_nothing_to_a_line_that_brakes_to_rest_and_prices_driving_there() -> None:
@@ -83,8 +107,9 @@ def test_amounts__of_pairs_and_worlds_have_the_weights_of_the_count() -> None:
 # ---------------------------------------------------------------- in random worlds
 
 
-def opened(name: str, count: str) -> tuple[Game, State]:
-    _, game = open_game(name, reward={"harm": 1.0, "harm_count": count})
+def opened(name: str, count: str, horizon_s: float = 8.0) -> tuple[Game, State]:
+    scenario = eb.load_scenario(name).replace(horizon_s=horizon_s)
+    _, game = open_game(scenario, reward={"harm": 1.0, "harm_count": count})
     return game, game.reset(game.draw(N, 5, 0))
 
 
@@ -99,8 +124,9 @@ def random_plans(game: Game, state: State, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_counts__are_ordered_never_fall_and_are_the_sum_of_what_steps_count(name: str) -> None:
+    stops = name in ("paper-random-obstacle", "cooperation-4-all")
     for count in COUNTS:
-        game, state = opened(name, count)
+        game, state = opened(name, count, 8.0 if stops else 2.0)
         plans, counted = random_plans(game, state, 1), state.harm(count)
         while not state.ended.all():
             before = {each: state.harm(each) for each in COUNTS}
@@ -113,7 +139,30 @@ def test_counts__are_ordered_never_fall_and_are_the_sum_of_what_steps_count(name
             assert (state.harm("total") >= state.harm("first")).all()
         assert counted == near(state.harm(count), rel=1e-12, abs=1e-9)
         met = (state.line[:, [PUSHED, DROVE, MOVING]] > 0.0).any(axis=(0, 2)).tolist()
-        assert met == [True, True, name not in ("paper-random-obstacle", "cooperation-4-all")]
+        assert met == [True, True, not stops]
+
+
+@pytest.mark.parametrize("name", [*SCENARIOS, "benchmark-truck", "benchmark-all", "realistic-truck-buildup"])
+def test_borne_harm__sums_to_that_of_the_line(name: str) -> None:
+    game, state = opened(name, "honest")
+    for plans in (random_plans(game, state, 1), np.full((N, 1, len(game.settings.learners)), -1.0)):
+        last, cost = follow_plans(game, state, plans, HONEST)
+        assert last.borne_harm().sum(axis=1) == near(cost, rel=1e-12)
+        own = amounts(objectives_of("own", last.vehicles), None, last, HONEST)
+        assert own.sum(axis=1) == near(cost, rel=1e-12) and (own >= 0.0).all()
+    common = last.line[:, PUSHED].sum(axis=1) / last.vehicles  # all brake with all they have
+    assert not last.line[:, ANSWERED].any()
+    impacts = last.borne_harm(eb.HarmCount("impacts", [0, 1, 1, 0, 0, 0], "impacts", "impacts", (EXACT_IMPACTS,)))
+    moving = np.where(last.moving[:, np.newaxis], np.nan, 0.0)
+    assert np.nan_to_num(last.borne_harm() - impacts + moving - 10.0 * common[:, np.newaxis]) == near(0.0, abs=1e-9)
+
+
+def test_own__gains_nothing_by_leaning_back_on_brakes_that_are_weaker() -> None:
+    _, game = open_game("cooperation-3-pair")
+    state = game.reset(eb.load_scenario("cooperation-3-pair").sample(2, seed=7)).take([1])
+    ends = [follow_plans(game, state, np.array([[[-1.0, action]]]), HONEST) for action in np.linspace(-1.0, -0.5, 6)]
+    own = np.array([last.borne_harm()[0, 2] for last, _ in ends])
+    assert (own[1:] >= own[0] - 1e-9).all()
 
 
 @pytest.mark.parametrize("count", COUNTS)

@@ -44,8 +44,8 @@ def test_digest_of_the_physics__has_all_results_and_no_other_rows(monkeypatch) -
     plain = digest_of(monkeypatch, lambda line: line)
     assert digest_of(monkeypatch, lambda line: with_row(line, 0.0)) == plain
     assert digest_of(monkeypatch, lambda line: with_row(line, 1.0)) == plain  # a later result, which has no name yet
-    digests = [digest_of(monkeypatch, changed(row)) for row in range(LINE_ROWS)]
-    assert len({plain, *digests}) == 1 + LINE_ROWS
+    digests = [digest_of(monkeypatch, changed(row)) for row in digest.RESULTS]
+    assert len({plain, *digests}) == 1 + len(digest.RESULTS) == LINE_ROWS  # all rows but ANSWERED
 
 
 def test_digest_of_the_physics__does_not_depend_on_the_order_of_rows(monkeypatch) -> None:

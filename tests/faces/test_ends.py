@@ -1,4 +1,4 @@
-"""An end after a number of steps is the end of a shorter horizon: rewards, infos, flags and shields."""
+"""An end after a number of steps is the end of a shorter horizon, but motion has no price, and infos say ``cut``."""
 
 from functools import partial
 from typing import Any
@@ -13,8 +13,7 @@ from tests.contract.interfaces import BARE, CRASH, EPISODE, FIVE, PAPER, REST, a
 
 PAIR = eb.load_scenario("cooperation-3-pair").replace(v2x="paper")
 EVERY = {
-    "harm": 1.0, "harm_count": "honest", "terminal": 3.0, "shaping": 0.5, "still_moving": 7.0, "risk": 0.1,
-    "last": 11.0,
+    "harm": 1.0, "harm_count": "total", "terminal": 3.0, "shaping": 0.5, "risk": 0.1, "last": 11.0,
 }  # fmt: skip
 NAMES = {"vector": "max_episode_steps"}  # of the argument; otherwise max_cycles
 
@@ -22,7 +21,7 @@ NAMES = {"vector": "max_episode_steps"}  # of the argument; otherwise max_cycles
 def last(before: eb.State, step: eb.Step, after: eb.State) -> Any:
     """Time, flags and harm of the step that ends an episode."""
     flags = step.truncated * 2.0 + step.terminated * 4.0 + step.safe_end * 8.0
-    return after.ended * (1.0 + after.time_s + flags + after.harm("honest"))
+    return after.ended * (1.0 + after.time_s + flags + after.harm("total"))
 
 
 @pytest.fixture(autouse=True)
@@ -46,6 +45,12 @@ def told(env: Any, steps: int, learners: list[str]) -> list[Any]:
     return values
 
 
+def cuts_of(values: list[Any]) -> list[bool]:
+    """The info ``cut`` of each return, taken out of the infos of all agents, which agree."""
+    cuts = [{info.pop("cut") for info in value[-1].values()} for value in values]
+    return [cut for (cut,) in cuts]
+
+
 def check_ends(scenario: eb.Scenario, steps: int) -> None:
     """Compare all terms of episodes of so many steps with those of a shorter horizon."""
     horizon_s = first_s(scenario) + steps * scenario.time_step_s
@@ -54,9 +59,10 @@ def check_ends(scenario: eb.Scenario, steps: int) -> None:
         told(eb.parallel_env(each, reward=EVERY, max_cycles=most), 5 * steps, learners)
         for each, most in ((scenario, steps), (scenario.replace(horizon_s=horizon_s), None))
     ]
+    ends = [len(value) == 4 and any(value[2].values()) for value in runs[0]]
+    assert sum(ends) == 5
+    assert cuts_of(runs[0]) == ends and not any(cuts_of(runs[1]))
     assert str(runs[0]) == str(runs[1])
-    ends = [value for value in runs[0] if len(value) == 4 and any(value[2].values())]
-    assert len(ends) == 5 and all(end[3]["vehicle_2"]["reward_still_moving"] == -1.0 for end in ends)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +114,8 @@ def test_most_steps__from_each_world_s_own_first_decision() -> None:
             _, reward, terminated, cut, info = alone.step(action[k])
         assert (reward, terminated, cut) == (rewards[k], False, True)
         final = {name: column[k] for name, column in infos["final_info"].items() if name in info}
-        assert {**final, "world_seed": 0, "world": 0} == {**info, "world_seed": 0, "world": 0}
+        assert final["cut"] and not info["cut"]
+        assert {**final, "world_seed": 0, "world": 0, "cut": 0} == {**info, "world_seed": 0, "world": 0, "cut": 0}
 
 
 def test_terminal__is_paid_by_hand_and_through_gymnasium() -> None:
@@ -116,7 +123,30 @@ def test_terminal__is_paid_by_hand_and_through_gymnasium() -> None:
     env = gymnasium.make("EthBrake-v3", scenario="paper-random", reward={"harm": 0, "terminal": 1}, max_cycles=2)
     env.reset(seed=7)
     assert [env.step([0.0])[1:4] for _ in range(2)] == [(0.0, False, False), (1.0, False, True)]
-    crash = eb.EthBrakeEnv(CRASH, reward={"harm": 1, "harm_count": "honest"}, max_cycles=4)
-    crash.reset()
-    costs = [crash.step([0.0])[1] for _ in range(4)]  # coasting at 20 m/s to the end at 0.9 s; Vehicle 1 has 14.6 m/s
-    assert costs == [0.0, 0.0, 0.0, pytest.approx(-(20.0**2) - 14.6**2)]
+
+
+def test_motion__has_a_price_at_the_horizon_alone() -> None:
+    # Coasting at 20 m/s until 0.9 s, without contact; Vehicle 1, which follows a script, then has 14.6 m/s.
+    price, reward = 20.0**2 - 14.6**2, {"harm": 1, "harm_count": "honest", "still_moving": 0, "shaping": 0.0}
+    for horizon_s, most, expected in (
+        (1.3, 4, (0.0, 0.0, True)),
+        (0.9, None, (-price, -1.0, False)),
+        (0.9, 4, (-price, -1.0, False)),  # a cut at the horizon is the horizon
+        (0.9, 9, (-price, -1.0, False)),
+    ):
+        scenario = CRASH.replace(horizon_s=horizon_s)
+        crash = eb.EthBrakeEnv(scenario, reward=reward, report=["still_moving"], max_cycles=most)
+        crash.reset()
+        steps = [crash.step([0.0]) for _ in range(4)]
+        assert [step[1] for step in steps] == [0.0, 0.0, 0.0, pytest.approx(expected[0])], (horizon_s, most)
+        assert [(step[4]["reward_still_moving"], step[4]["cut"]) for step in steps] == [(0.0, False)] * 3 + [
+            expected[1:]
+        ]
+        assert steps[-1][2:4] == (False, True)
+
+
+def test_cut__is_false_where_all_vehicles_have_come_to_rest() -> None:
+    env = eb.EthBrakeEnv(REST, max_cycles=10)  # at rest in its 10th step
+    env.reset()
+    *_, last_step = [env.step([-1.0]) for _ in range(10)]
+    assert last_step[2:4] == (True, False) and last_step[4]["cut"] is False

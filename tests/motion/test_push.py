@@ -103,6 +103,79 @@ def test_push__by_hand(name: str) -> None:
     assert after[0, at.PUSHED, -1] == 0.0
 
 
+# The line, its command, the end, the push of every pair, and the push for which every vehicle answers (m/s).
+ANSWERS: dict[str, tuple[Any, Any, float, list[float], list[float]]] = {
+    "one between, that brakes fully, is pushed through": (  # 5 - -6 behind; (-6 + 5) / 2 - -6 in front
+        lines([0.0, 0.0], [20.0] * 3, braking_capacity_mps2=6.0), [-6.0, -6.0, 5.0], 1.0,
+        [0.0, 5.5, 11.0], [0.0, 0.0, 16.5],
+    ),
+    "the same from rest": (  # 14 - -6 behind; (-6 + 14) / 2 - -6 in front; for 2 s
+        lines([0.0, 0.0], [0.0] * 3, braking_capacity_mps2=6.0), [-6.0, -6.0, 14.0], 2.0,
+        [0.0, 20.0, 40.0], [0.0, 0.0, 60.0],
+    ),
+    "the one between answers for what it adds": (  # pair 1, 1.2 - -6: 6 of Vehicle 2, 1.2 of Vehicle 3; for 1.5 s
+        lines([0.0, 0.0], [9.0] * 3, mass_t=[1.0, 2.0, 3.0]), [-6.0, 0.0, 2.0], 1.5,
+        [0.0, 10.8, 6.0], [0.0, 9.0, 1.8 + 6.0],
+    ),
+    "two press on one that does not": (
+        # pair 1: (-6 + 0 + 2 x 2) / 4 - -6, in proportion to 1 x 6 and 2 x 8; pair 2: 6 of Vehicle 3 and 4 / 3
+        lines([0.0] * 3, [20.0] * 4, mass_t=[1.0, 1.0, 1.0, 2.0]), [-6.0, -6.0, 0.0, 2.0], 1.0,
+        [0.0, 5.5, 6.0 + 4.0 / 3.0, 6.0], [0.0, 0.0, 1.5 + 6.0, 4.0 + 4.0 / 3.0 + 6.0],
+    ),
+    "the last one presses, but on one that brakes hard": (
+        # pair 1: the mean is largest up to Vehicle 3, (-4 + 0) / 2 - -6: 2 of Vehicle 2, 2 of Vehicle 3
+        lines([0.0] * 4, [20.0] * 5), [-6.0, -4.0, 0.0, -10.0, 5.0], 1.0,
+        [0.0, 4.0, 5.0, -2.5 + 10.0 / 3.0, 15.0], [0.0, 2.0, 2.0 + 5.0, 0.0, -2.5 + 10.0 / 3.0 + 15.0],
+    ),
+    "both brake fully": (  # 1 m/s2 until they rest; nobody answers
+        lines([0.0], [20.0, 20.0], braking_capacity_mps2=[7.0, 6.0]), [-7.0, -6.0], 5.0, [0.0, 20.0 / 6.5], [0.0, 0.0],
+    ),
+    "one presses through another, and brakes fully": (
+        lines([0.0, 0.0], [20.0] * 3, braking_capacity_mps2=[16.0, 16.0, 4.0]), [-8.0, -8.0, -4.0], 1.0,
+        [0.0, 2.0, 4.0], [0.0, 0.0, 0.0],
+    ),
+    "one of two that press brakes fully": (  # pair 1, -5 - -8: in proportion to 2 (Vehicle 3) and 4 (Vehicle 4)
+        lines([0.0] * 3, [20.0] * 4, braking_capacity_mps2=[16.0, 16.0, 6.0, 16.0]), [-8.0, -8.0, -6.0, -4.0], 1.0,
+        [0.0, 2.0, 3.0, 10.0 / 3.0], [0.0, 0.0, 0.0, 4.0 / 3.0 + 1.0 + 10.0 / 3.0],
+    ),
+    "brakes of one between build up": (  # -6; 3 - 2 t; 1. Vehicle 2: 9 - 2 t; the rest of 11.375 is of Vehicle 3
+        lines([0.0, 0.0], [20.0] * 3, force_mps2=[-6.0, 3.0, 1.0], brake_rate_mps3=[np.inf, 2.0, np.inf]),
+        [-6.0, -2.0, 1.0], 1.5, [0.0, 11.375, 4.875], [0.0, 11.25, 5.0],
+    ),
+    "brakes build up to their capacity": (  # -6 and -2 t: 6 - 2 t until 2 s
+        lines([0.0], [20.0, 20.0], braking_capacity_mps2=[16.0, 4.0], brake_rate_mps3=[np.inf, 2.0]), [-6.0, -4.0], 2.0,
+        [0.0, 8.0], [0.0, 0.0],
+    ),
+    "full braking that is not yet in effect": (
+        lines([0.0], [20.0, 20.0], braking_capacity_mps2=[16.0, 4.0], latency_s=[0.0, 1.0]), [-6.0, -4.0], 2.0,
+        [0.0, 6.0 + 2.0], [0.0, 6.0],
+    ),
+    "brakes of the one between take over at rest": (
+        lines([0.0, 0.0], [0.0] * 3, force_mps2=[-4.0, 0.0, 2.0], brake_rate_mps3=[np.inf, 1.0, np.inf]),
+        [-4.0, -3.5, 2.0], 3.0, [0.0, 1.0, 6.0], [0.0, 0.0, 7.0],
+    ),
+    "against an obstacle": (  # 3 x 2 of Vehicle 1, the rest of 7.5 of Vehicle 2
+        lines([0.0], [0.0, 0.0], obstacle_gap_m=0.0, mass_t=[1.0, 3.0]), [3.0, 4.0], 2.0, [7.5, 8.0], [6.0, 9.5],
+    ),
+    "further impacts": (
+        lines([0.0], [24.0, 28.0], restitution=0.5), [-6.0, -2.0], 2.5, [0.0, 8.0], [0.0, 8.0],
+    ),
+    "further impacts under full braking": (
+        lines([0.0], [24.0, 28.0], restitution=0.5, braking_capacity_mps2=[16.0, 2.0]), [-6.0, -2.0], 2.5,
+        [0.0, 8.0], [0.0, 0.0],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ANSWERS)
+def test_answers__by_hand(name: str) -> None:
+    (line, car), command, until, pushes, answers = ANSWERS[name]
+    after, _, _ = driven(line, car, command, 0.0, until)
+    assert after[0, at.PUSHED, :-1].tolist() == pytest.approx(pushes, abs=1e-7)
+    assert after[0, at.ANSWERED, :-1].tolist() == pytest.approx(answers, abs=1e-7)
+    assert after[0, at.ANSWERED, -1] == 0.0
+
+
 def test_push__adds_up_from_interval_to_interval() -> None:
     line, car = lines([0.0], [10.0, 10.0])
     half, _, _ = driven(line, car, [-8.0, 0.0], 0.0, 0.5)

@@ -38,6 +38,7 @@ from ethbrake_marl.motion.layout import (
     NEXT_CLOSING,
     NEXT_TIME,
     OWN_LATENCY,
+    SCRIPTED,
     SPEED,
     Floats,
     Ints,
@@ -107,6 +108,7 @@ def known_line(line, car, clock, know, i, observer_line, parameters, commands):
     for j in range(line.shape[1]):
         for row in range(CAR_ROWS):
             parameters[row, j] = car[row, j]
+        parameters[SCRIPTED, j] = 0.0  # the assumed commands are nobody's script
         inside, force = first <= j <= last, line[FORCE, j]
         observer_line[SPEED, j] = line[SPEED, j] if inside else 0.0
         observer_line[FORCE, j] = force if inside else 0.0

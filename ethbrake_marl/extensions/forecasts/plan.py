@@ -99,7 +99,7 @@ def plan_worlds(line, car, clock, know, observers, time_step_s, weights, memory,
                     outcome = move_line(here, parameters, commands, scratch, 0.0, FORECAST_S)
                     if outcome == FAILED:
                         failed = k
-                    note_motion(here)
+                    note_motion(here, parameters)
                     write_impacts(scratch, outcome == EVENT_BY_EVENT, i, first, last, time_step_s, trials[c])
                     costs[c] = amount_so_far(here, weights)
                     trials[c, COST] = math.sqrt(costs[c])

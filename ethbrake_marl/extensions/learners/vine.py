@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import Tensor, nn
 
-from ethbrake_marl.episode.counts import beside_harm
+from ethbrake_marl.episode.counts import amount_so_far
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import TIME, State
@@ -323,7 +323,7 @@ def find_standing(
     bodies = line.shape[2]
     for k in range(len(out)):
         time = clock[k, TIME]
-        grown = beside_harm(line[k], weights) - beside_harm(before[k], weights)
+        grown = amount_so_far(line[k], weights) - amount_so_far(before[k], weights)
         stands = grown == 0.0
         for i in range(bodies):
             stands = stands and before[k, SPEED, i] == 0.0 and line[k, SPEED, i] == 0.0

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.counts import amount_so_far
-from ethbrake_marl.episode.state import END, FIRST_DECISION, LAST
+from ethbrake_marl.episode.state import END, FIRST_DECISION, HORIZON, LAST
 from ethbrake_marl.episode.step import note_motion, stands
 from ethbrake_marl.extensions.search.pricing import UInt64s, worth
 from ethbrake_marl.motion.compiling import kernel, large
@@ -112,8 +112,8 @@ def follow(world, lines, ends, commands, phase, most):
                 if move_line(line, world.car, world.wanted, world.scratch, start, until) == FAILED:
                     return value, -1
                 at_rest = stands(line, world.wanted)
-                if step >= clock[LAST]:
-                    note_motion(line)
+                if step >= clock[LAST] and clock[END] >= clock[HORIZON]:
+                    note_motion(line, world.car)
             value = search_value(world, line)
         if value >= most or at_rest:
             return value, p + 1

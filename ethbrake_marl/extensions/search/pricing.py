@@ -20,13 +20,15 @@ from ethbrake_marl.episode.counts import (
     HarmCount,
     all_counts,
     amount_so_far,
+    common_push,
+    conduct_amount,
     pair_amount,
     unshared_amount,
 )
 from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
-from ethbrake_marl.episode.state import END, ENDED, FIRST_DECISION, LAST, STEPS, State, require
+from ethbrake_marl.episode.state import END, ENDED, FIRST_DECISION, HORIZON, LAST, STEPS, State, require
 from ethbrake_marl.episode.step import advance, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
@@ -269,7 +271,8 @@ def problem_of(
     Raises ``InvalidInput`` for vehicles that do not exist, an unknown count, an objective that is not a weighted sum of
     harm or ``maximin``, and a script that observes the state, whose commands are not known at the alert.
     """
-    require(game.marked(alert), "a search for the best braking", SHOWN)
+    alert = game.marked(alert)
+    require(alert, "a search for the best braking", SHOWN)
     count = HarmCount.of(harm_count)
     chosen = np.array(game.settings.learners if bodies is None else bodies, np.int64)
     if not len(chosen) or len(np.intersect1d(chosen, range(1, alert.vehicles + 1))) < len(chosen):
@@ -287,6 +290,7 @@ def problem_of(
     state = first_decision(alert._replace(wanted=wanted, memories={}), decide, game.settings)
     shares = np.zeros((alert.n, 3, wanted.shape[1]))
     times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST, END]]]
+    times += [state.clock[:, [HORIZON]]] if (state.clock[:, END] < state.clock[:, HORIZON]).any() else []
     identity = identities(alert._replace(wanted=wanted), chosen, np.hstack(times))
     return with_objective(Problem(chosen, state, dt, count, WHOLE_LINE, shares, identity), objective)
 
@@ -315,7 +319,7 @@ def beside_braking(problem: Problem, single_problem: Problem, profiles: Profiles
 def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
     """Hash of everything that decides the harm of a profile, [n]: 8 bytes of BLAKE2b of each world.
 
-    ``times`` [n, 4]: first decision, time step, number of steps, end.
+    ``times`` [n, 4]: first decision, time step, number of steps, end; and the horizon if some end is before it.
     """
     line, car, digests = alert.line, alert.car, np.empty(alert.n, np.uint64)
     controlled = np.zeros(alert.wanted.shape)
@@ -375,14 +379,14 @@ def worth(line, shares, weights, aim):
     """
     if aim == WHOLE_LINE:
         return amount_so_far(line, weights)
-    value, from_ahead = 0.0, 0.0
+    value, from_ahead, common = 0.0, 0.0, common_push(line)
     for i in range(line.shape[1]):
         borne = from_ahead
         if i < line.shape[1] - 1:
             unshared = unshared_amount(line, i, weights)
             shared = pair_amount(line, i, weights) - unshared
             borne += shares[0, i] * shared
-            from_ahead = shares[1, i] * shared + shares[2, i] * unshared
+            from_ahead = shares[1, i] * shared + shares[2, i] * conduct_amount(line, i, common, weights)
         value = max(value, borne) if aim == LARGEST else value + borne
     return value
 

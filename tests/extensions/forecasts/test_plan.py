@@ -36,7 +36,7 @@ def cost(state: State, body: int, action: Any, others: Any) -> np.ndarray:
     before[:, rows] = state.line[:, rows]
     line, _, _ = driven(before, state.car, commands, state.time_s, state.time_s + FORECAST_S)
     for one in line:
-        note_motion(one)
+        note_motion(one, np.zeros_like(state.car[0]))
     return state._replace(line=line).harm("honest")
 
 

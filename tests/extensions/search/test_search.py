@@ -22,11 +22,12 @@ from ethbrake_marl.extensions.search.search import (
     refine,
     search_profiles,
 )
-from ethbrake_marl.motion.layout import DROVE, MOVING, Floats
+from ethbrake_marl.motion.layout import DROVE, MOVING, PUSHED, Floats
 from tests.extensions.proofs.worlds import worlds
 from tests.refused import refused
 
 SCENARIO, GAME = eb.open_game("paper-random")
+SHORT = eb.open_game(SCENARIO.replace(horizon_s=1.0))[1]  # Vehicle 2 has not yet reached Vehicle 1
 
 problem_of = partial(pricing.problem_of, harm_count="first")
 best_harm = partial(searching.best_harm, harm_counts=("first", "total"))
@@ -154,7 +155,7 @@ def test_search_list__continues_only_a_search_in_the_same_physics(tmp_path, requ
 
 @pytest.mark.parametrize("stepwise", [False, True])
 def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool) -> None:
-    problem, values = paper().with_count(HONEST), np.empty(1)
+    problem, values = problem_of(SHORT, sampled(), harm_count="honest"), np.empty(1)
     driving, random = problem.constant(problem.bounds[:, np.newaxis, :, 1]), random_states(problem.identity, 0)
     last = problem.follow(driving)
     assert last.line[:, MOVING].any(axis=1).all()
@@ -166,10 +167,11 @@ def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool
 
 @pytest.mark.parametrize("objective", ["own", "maximin"])
 def test_value__of_the_honest_cost_of_vehicles_is_the_amount_of_the_objective(objective: str) -> None:
-    problem = problem_of(GAME, sampled(), harm_count="honest", objective=objective)
-    last = problem.follow(problem.constant(problem.bounds[:, np.newaxis, :, 1]))
-    assert last.line[:, MOVING].any(axis=1).all() and last.line[:, DROVE].any(axis=1).all()
-    assert problem.value(last) == pytest.approx(amounts(objectives_of(objective, 3), None, last, HONEST)[:, 1])
+    for game, row in ((SHORT, MOVING), (GAME, PUSHED)):
+        problem = problem_of(game, sampled(), harm_count="honest", objective=objective)
+        last = problem.follow(problem.constant(problem.bounds[:, np.newaxis, :, 1]))
+        assert last.line[:, row].any(axis=1).all() and last.line[:, DROVE].any(axis=1).all()
+        assert problem.value(last) == pytest.approx(amounts(objectives_of(objective, 3), None, last, HONEST)[:, 1])
 
 
 def test_extremes__are_better_than_constants() -> None:
