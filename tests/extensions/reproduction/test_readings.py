@@ -77,9 +77,7 @@ def test_hybrid__is_what_the_shield_does(reading: Reading, spec: str) -> None:
 
 @pytest.mark.parametrize("reading", [STATED._replace(step_s=0.2), EARLY], ids=lambda reading: reading.name)
 def test_baselines__are_what_the_agents_do(reading: Reading) -> None:
-    result = eb.evaluate(
-        reading.scenario(RANDOM), "full_brake,e_v2x_bm:pairwise", episodes=WORLDS, harm_count="first"
-    )
+    result = eb.evaluate(reading.scenario(RANDOM), "full_brake,e_v2x_bm:pairwise", episodes=WORLDS, harm_count="first")
     for row, name in ((NON_E, "full_brake"), (E_V2X_BM, "e_v2x_bm:pairwise")):
         collided, harm = report_outcome(row, reading, WORLDS)
         assert np.array_equal(harm, result[name]["first_impact_harm"])

@@ -279,8 +279,7 @@ def test_hybrid_table__has_every_printed_number() -> None:
 
 def test_safety_bound__is_exceeded_where_algorithm_1_foresees_less_than_it_does() -> None:
     does, bound = (
-        report_outcome(HYBRID_PPO, Reading(hybrid=reported), 100, "sac")[1]
-        for reported in ("realised", "predicted")
+        report_outcome(HYBRID_PPO, Reading(hybrid=reported), 100, "sac")[1] for reported in ("realised", "predicted")
     )
     hybrid = strategies.strategies(STATED, 100, {"PPO": "sac"})[HYBRID_PPO]
     assert strategies.above_bound(hybrid) == (does > bound + 1e-9).sum() > 0
