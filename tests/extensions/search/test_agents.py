@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import IMPACT_COUNTS, HarmCount
+from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, IMPACT_COUNTS, HarmCount
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.extensions.search.agents import SearchAround
 from ethbrake_marl.extensions.search.best_harm import search_list
