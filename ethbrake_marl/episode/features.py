@@ -42,7 +42,7 @@ OWN = (
     Feature("restitution", "1", 1.0, 0.0, 1.0, "coefficient of restitution of all impacts"),
 )
 NEIGHBOUR = (
-    Feature("known", "1", 1.0, 0.0, 1.0, "1 if this neighbour exists and its state is known"),
+    Feature("known", "1", 1.0, 0.0, 1.0, "1 if this neighbour exists, can matter, and its state is known"),
     Feature("gap", "m", 10.0, 0.0, 10.0, "sum of the gaps between this vehicle and the neighbour"),
     Feature("closing_speed", "m/s", 10.0, -4.0, 4.0, "closing speed of the two, above 0 if they approach"),
     Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "acceleration in force of the neighbour"),
@@ -57,8 +57,8 @@ NEIGHBOUR = (
     ),
 )  # fmt: skip
 ROLE = (
-    Feature("vehicles_ahead", "1", 1.0, 0.0, 2.0, "number of vehicles ahead in the line; 2 means 2 or more"),
-    Feature("vehicles_behind", "1", 1.0, 0.0, 2.0, "number of vehicles behind in the line; 2 means 2 or more"),
+    Feature("vehicles_ahead", "1", 1.0, 0.0, 2.0, "number of vehicles ahead that can matter; 2 means 2 or more"),
+    Feature("vehicles_behind", "1", 1.0, 0.0, 2.0, "number of vehicles behind that can matter; 2 means 2 or more"),
 )
 OBSTACLE_FEATURES = (
     Feature("known", "1", 1.0, 0.0, 1.0, "1 if there is an obstacle ahead of the line and this vehicle knows of it"),

@@ -134,8 +134,11 @@ def test_obstacle__is_known_with_the_place_of_vehicle_1() -> None:
     assert seen_by(game, state, 2)["obstacle.gap"] == pytest.approx((60 - 9 + 8) / 10)
 
 
-def test_forecast__ends_before_a_vehicle_of_which_a_piece_is_missing() -> None:
+def test_forecast__needs_both_neighbours_and_ends_before_a_farther_vehicle_of_which_a_piece_is_missing() -> None:
     pytest.importorskip("ethbrake_marl.extensions.forecasts")  # whose feature is `contact`
-    game, state = played({"tells": {"vehicle_1": [*PIECES[:5]]}}, ["contact"])  # no mass
+    game, state = played({"tells": {"vehicle_1": [*PIECES[:5]]}}, ["contact", "front_1.known"])  # no mass
     seen = seen_by(game, state, 2)
-    assert seen["contact.brake_front_time"] == 0.0 and seen["contact.brake_rear_time"] > 0.0
+    assert seen.pop("front_1.known") == 1.0 and set(seen.values()) == {0.0}
+    while state.time_s[0] < 1.2:  # Vehicle 3 has waited for its latency
+        state = stepped(game, state, -1.0)
+    assert seen_by(game, state, 3)["contact.brake_front_time"] > 0.0

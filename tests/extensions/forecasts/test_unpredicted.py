@@ -1,0 +1,96 @@
+"""A neighbour that is known, but cannot be predicted: there is no forecast, and agents brake fully."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.episode.observe import View
+from tests.episode.lines import later, state_of
+
+pytest.importorskip("ethbrake_marl.extensions.messages")
+
+PIECES = ["place", "speed", "acceleration", "braking_capacity", "latency", "mass"]
+FORECASTS = ["plan", "contact", "contact_far"]
+
+
+def without(scenario: Any, piece: str, senders: list[int], **v2x: Any) -> eb.Scenario:
+    """Scenario in which the messages of ``senders`` lack a piece."""
+    tells = {f"vehicle_{sender}": [name for name in PIECES if name != piece] for sender in senders}
+    channel = {"preset": "nominal", "persistence": "periodic", "tells": tells, **v2x}
+    return eb.load_scenario(scenario).replace(v2x=channel)
+
+
+@pytest.mark.parametrize("piece", ["mass", "latency", "braking_capacity"])
+@pytest.mark.parametrize("senders", [[1], [3], [1, 3]])
+@pytest.mark.parametrize("scenario", ["paper-random", "cooperation-2-five"])
+def test_neighbour_without_a_piece__is_met_with_full_braking(scenario: str, senders: list[int], piece: str) -> None:
+    result = eb.evaluate(
+        without(scenario, piece, senders), "full_brake,plan,universal", episodes=20, harm_count="honest"
+    )
+    full = result["full_brake"]["honest_cost"]
+    np.testing.assert_array_equal(result["plan"]["honest_cost"], full)
+    np.testing.assert_allclose(result["universal"]["honest_cost"].mean(), full.mean(), rtol=0.01)
+    assert result["universal"]["outside"].mean() > 0.95
+
+
+def test_farther_vehicle_without_a_piece__ends_the_forecast_before_it() -> None:
+    result = eb.evaluate(without("cooperation-2-five", "mass", [5]), "full_brake,plan,universal", episodes=50)
+    cost = {name: result[name]["honest_cost"].mean() for name in result}
+    assert max(cost["plan"], cost["universal"]) < 0.8 * cost["full_brake"]
+    assert (result["universal"]["outside"] == 0.0).all()
+
+
+def observed(scenario: eb.Scenario, until_s: float) -> dict[str, np.ndarray]:
+    _, game = eb.open_game(scenario, observation=["front_1.known", *FORECASTS])
+    state = game.reset(scenario.sample(20, 7))
+    while state.time_s[0] < until_s - 1e-9:
+        state, _ = game.step(state, np.full((20, 1), -1.0))
+    return dict(zip(game.views[2].names, game.observe(state, np.array([2]))[0].T, strict=True))
+
+
+def test_forecast__waits_until_the_neighbour_can_be_predicted() -> None:
+    sight = {"link_latency_s": 0.0, "senses": "front", "sensing_s": [0.9, 0.9]}
+    scenario = without("paper-random", "acceleration", [1], **sight)
+    before, after = observed(scenario, 0.7), observed(scenario, 1.0)
+    assert (before["front_1.known"] == 1.0).all() and (before["plan.known"] == 0.0).all()
+    assert (before["plan.action"] == -1.0).all() and (after["plan.known"] == 1.0).all()
+    times = [name for name in before if name.endswith("_time") and "own_" not in name]
+    assert len(times) > 10 and not any(before[name].any() for name in times)
+    assert all(after[name].all() for name in ("plan.brake_front_time", "contact.brake_rear_time"))
+    assert (after["plan.action"] > -1.0).any()
+
+
+def test_far_neighbour_without_a_piece__does_not_matter() -> None:
+    four = eb.load_scenario("paper-random").replace(
+        vehicles=4, gaps_m=[200, 7, 8], braking_capacity_mps2=[6, 7, 6, 6], driving_capacity_mps2=6, mass_t=5,
+        latency_s=[0, 0.5, 0.8, 0.8], early_impacts="keep",
+    )  # fmt: skip
+    told = four.replace(v2x={"preset": "nominal", "persistence": "periodic"})
+    results = [
+        eb.evaluate(line, "full_brake,plan,universal", episodes=20) for line in (told, without(four, "mass", [1]))
+    ]
+    for name in ("plan", "universal"):
+        costs = [result[name]["honest_cost"] for result in results]
+        np.testing.assert_array_equal(*costs)
+        assert costs[0].mean() < 0.8 * results[0]["full_brake"]["honest_cost"].mean()
+    np.testing.assert_array_equal(*(result["universal"]["outside"] for result in results))
+
+
+def test_who_knows_nobody__brakes_fully() -> None:
+    scenario = eb.load_scenario("paper-random").replace(v2x="blocked", horizon_s=20, early_impacts="keep")
+    state = later(scenario.sample(300, 1), 0.0, 0.6)
+    nobody = (state.know[:, 2, [1, 3]] > 0.6).all(axis=1)
+    action = View(["plan.action"]).observe(state, np.array([2]), 0.1)[:, 0, 0]
+    assert 10 < nobody.sum() < 290 and (action[nobody] == -1.0).all() and (action[~nobody] > -1.0).any()
+
+
+def test_vehicle_1__plans_alone_for_an_obstacle() -> None:
+    state = state_of([30.0], [20.0, 20.0], obstacle_gap_m=60.0, braking_capacity_mps2=5.0)
+    know = state.know.copy()
+    know[:, 1, 2] = np.inf
+    action = View(["plan.action"]).observe(state._replace(know=know), np.array([1]), 0.1)[0, 0, 0]
+    assert -1.0 < action < -0.6  # 400 / 120 m/s2 are enough
