@@ -10,6 +10,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 
 from ethbrake_marl.episode.full_state import full_state
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
+from ethbrake_marl.faces.shield import shield
 from tests.contract.interfaces import CRASH, PAPER
 from tests.refused import refused
 
@@ -125,6 +126,12 @@ REFUSED: dict[str, Callable[[], Any]] = {
 def test_refusals(message: str) -> None:
     with refused(message):
         REFUSED[message]()
+
+
+def test_behind_a_shield__a_missing_action_is_no_proposal() -> None:
+    env = shield(EthBrakeParallelEnv(), "full_brake")
+    env.reset(seed=7)
+    assert env.step({})[4]["vehicle_2"]["shield_proposed_action"] == -1.0
 
 
 def test_a_line_without_learners__plays_by_itself() -> None:
