@@ -49,6 +49,11 @@ class Fog(eb.ChannelKey):
         return eb.Layer()
 
 
+def weigh(count: eb.HarmCount) -> float:
+    eb.register_count("pushes", [0, 1, 0, 10, 0, 0], column="pushes_cost", words="cost of pushes")
+    return float(count.weights.sum())
+
+
 def shield_of(game: eb.Game) -> eb.Shield | None:
     return game.shield
 

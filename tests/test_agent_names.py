@@ -20,6 +20,7 @@ from ethbrake_marl.agent_names import (
     teams_of,
 )
 from ethbrake_marl.agents.team import Team
+from ethbrake_marl.episode.counts import ALL_IMPACTS
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.worlds.catalogue import load_scenario
 
@@ -128,7 +129,7 @@ def test_a_registered_agent__is_made_with_argument_policy_and_scenario():
     register_agent("theirs", make, form="theirs[:ARGUMENT][@PATH]")
     make_agent("theirs:a:b@~/x", scenario=PAPER, harm_count="total")
     (argument, policy, scenario, count, spec) = asked[0]
-    assert (argument, scenario, count, spec) == ("a:b", PAPER, "total", "theirs:a:b@~/x")
+    assert (argument, scenario, count, spec) == ("a:b", PAPER, ALL_IMPACTS, "theirs:a:b@~/x")
     assert policy == str(Path.home() / "x")
 
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agent_names import AGENTS, WRAPPERS, make_agent, make_teams
-from ethbrake_marl.agents.team import Team
+from ethbrake_marl.agent_names import AGENTS, WRAPPERS, make_teams
 from ethbrake_marl.episode import departures
 from ethbrake_marl.episode.departures import departures_of
 from ethbrake_marl.episode.features import GROUPS
@@ -191,10 +190,8 @@ def test_exact_physics__keeps_everything() -> None:
         assert {*plain[spec]} == {*exact[spec]} >= {"honest_cost"}
         for name, values in plain[spec].items():
             np.testing.assert_array_equal(values, exact[spec][name], name)
-    game = eb.open_game(PAPER)[1]._replace(physics=Exact())
-    team = Team.of({"vehicle_2": make_agent("full_brake")}, "brake")
-    assert eb.record_episode(PAPER.sample(1, 7), team, game).gaps_m.size
     register_physics("same", Exact())
+    assert eb.record_episode(PAPER.replace(physics="same"), "full_brake").gaps_m.size
     v2x = {"preset": "nominal", **({"persistence": "periodic"} if "persistence" in CHANNEL_KEYS else {})}
     eb.parallel_env(PAPER.replace(physics="same", v2x=v2x)).reset(seed=7)
 

@@ -82,8 +82,8 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
     >>> observation.shape, info["time_s"]
     ((27,), 0.5)
     >>> observation, reward, terminated, truncated, info = env.step([-1.0])
-    >>> reward, terminated, truncated
-    (0.0, False, False)
+    >>> round(reward, 3), terminated, truncated
+    (0.018, False, False)
     """
 
     metadata: Any = Metadata()

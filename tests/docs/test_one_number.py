@@ -111,7 +111,7 @@ def prose() -> Iterator[tuple[str, str]]:
 
 def test_number__of_an_agent_in_a_test_is_the_same_on_all_pages() -> None:
     found = all_facts()
-    assert len(found) > 93
+    assert len(found) > 85
     assert {key: shown for key, shown in found.items() if any(differ(a, b) for a in shown for b in shown)} == {}
 
 

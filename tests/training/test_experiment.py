@@ -37,7 +37,7 @@ def test_one_learner__is_compared_alone_and_in_the_hybrid(count: str, tmp_path: 
     found = quick(run, recipe=SHORT.replace(reward={"harm": 1.0, "harm_count": count}))
     names = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
     assert [*found.compared.teams] == names and found.learned == "trained policy"
-    assert found.compared.harm_count == count
+    assert found.compared.harm_count == HarmCount.of(count)
     specs = {"e_v2x_bm": "e_v2x_bm", "trained policy": f"policy@{run}", "hybrid": f"policy@{run}+episode"}
     again = eb.evaluate("paper-random", [*specs.values()], episodes=EPISODES, harm_count=count)
     for name, spec in specs.items():

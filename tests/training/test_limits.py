@@ -96,7 +96,7 @@ def test_value__at_its_limit_is_accepted_and_beyond_it_is_refused(
         assert [accepts(recipe, place, value) for value in each] == [right] * len(each), each
 
 
-WORDS = {"name", "title", "description", "source", "algorithm", "scheme", "observation", "horizon_is_end"}
+WORDS = {"name", "title", "description", "source", "algorithm", "scheme", "observation", "horizon_is_end", "scenario"}
 
 
 @pytest.mark.parametrize(("recipe", "own"), [(PpoRecipe, OF_PPO), (SacRecipe, OF_SAC)])

@@ -81,7 +81,7 @@ def test_train__reports_and_returns_what_its_folder_says(trained: tuple[Path, An
         assert told == ("finished", 6 * UPDATE, 6)
     assert status["evaluations"] == list(result.evaluations)
     assert [(report.done, report.total) for report in reports] == [(UPDATE * k, 6 * UPDATE) for k in range(7)]
-    assert TrainingRecipe.model_fields.keys() - config["recipe"].keys() == {"observation"}
+    assert TrainingRecipe.model_fields.keys() - config["recipe"].keys() == {"observation", "scenario"}
     assert config["settings"] == ["x=1"]
 
 
@@ -196,7 +196,7 @@ def test_train__keeps_the_best_by_the_count_of_the_reward(count: str, best: int,
 
 
 def test_train__objectives_decide_where_they_are_not_the_harm_of_the_line(tmp_path: Path) -> None:
-    recipe = TINY.replace(reward={"harm": 0.05, "objective": "own"}, total_steps=UPDATE)
+    recipe = TINY.replace(reward={"harm": 0.05, "harm_count": "first", "objective": "own"}, total_steps=UPDATE)
     result = train(recipe, PAIR, tmp_path / "run", on_progress=None)
     scenario, game = open_game(PAIR)
     last = play_to_end(game, scenario.sample(10, 7), team_of(make_agent(result.agent, scenario=PAIR), scenario))

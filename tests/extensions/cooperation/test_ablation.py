@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import BUILT_IN_COUNTS
+from ethbrake_marl.episode.counts import ALL_IMPACTS, BUILT_IN_COUNTS, FIRST_IMPACTS
 from ethbrake_marl.extensions.cooperation.ablation import Answer, LevelResult, can_imitate, least_known
 from ethbrake_marl.extensions.cooperation.levels import Level
 from ethbrake_marl.extensions.cooperation.results import comparison, levels_csv
@@ -77,18 +77,18 @@ def answer(level: str, budget: int, n: int = 6, **changes: object) -> Answer:
     scenario = eb.load_scenario(level).replace(**changes)
     loaded, game = eb.open_game(scenario)
     worlds = loaded.sample(n, 7)
-    found = best_harm(game, worlds, budget=budget, threads=1)
+    found = best_harm(game, worlds, harm_counts=("first", "total"), budget=budget, threads=1)
     return Answer(loaded, game, worlds, found, {"first": [], "total": []})
 
 
 def test_optimum__of_a_level_counts_what_fewer_learners_do_and_what_teams_did() -> None:
     two, both = answer("cooperation-2-paper", 2_000), answer("cooperation-3-pair", 1)
     assert can_imitate(both, two).all() and not can_imitate(two, both).any()
-    alone, together = (least_known(both, each, "first") for each in ([both], [two, both]))
+    alone, together = (least_known(both, each, FIRST_IMPACTS) for each in ([both], [two, both]))
     assert (together <= alone).all() and (together <= two.searched.harm["first"] + 1e-9).all()
     both.team_harm["first"].append(np.array([0.0, *together[1:]]))
-    assert least_known(both, [two, both], "first")[0] == 0.0
-    assert least_known(both, [two, both], "total")[0] == pytest.approx(least_known(both, [two], "total")[0])
+    assert least_known(both, [two, both], FIRST_IMPACTS)[0] == 0.0
+    assert least_known(both, [two, both], ALL_IMPACTS)[0] == pytest.approx(least_known(both, [two], ALL_IMPACTS)[0])
 
 
 def test_optimum__of_a_level_with_an_obstacle_is_simulated_with_it() -> None:
@@ -96,7 +96,7 @@ def test_optimum__of_a_level_with_an_obstacle_is_simulated_with_it() -> None:
     free.team_harm["first"].append(np.zeros(6))  # without the obstacle, so it must not count
     assert (free.worlds.line[:, GAP, 0] >= FAR_M).all() and can_imitate(ahead, free).all()
     assert not can_imitate(free, ahead).any()
-    assert (least_known(ahead, [free], "first") > 1.0).all()
+    assert (least_known(ahead, [free], FIRST_IMPACTS) > 1.0).all()
 
 
 def test_levels__of_other_roles_or_latencies_cannot_be_imitated() -> None:

@@ -83,7 +83,7 @@ def test_point__is_never_beaten_by_a_shipped_policy_that_was_not_given() -> None
 @pytest.mark.parametrize("spec", AGENTS)
 def test_agents__beside_the_front_bear_what_an_evaluation_says(spec: str, front: Front) -> None:
     scenario, game = eb.open_game(preferring(WEIGHTS[4]))
-    agent = eb.make_agent(spec, scenario=scenario)
+    agent = eb.make_agent(spec, scenario=scenario, harm_count="first")
     last = play_to_end(game, scenario.sample(20, 7), Team(spec, {2: agent}))
     for count in (each.name for each in BUILT_IN_COUNTS):
         assert front.agents[spec][count][4].tolist() == last.borne_harm(count).tolist()
@@ -106,7 +106,7 @@ def test_honest_cost__is_the_default_and_leaves_less_of_it_than_the_papers_rules
     cost, papers, universal = (each["honest"][0].sum(axis=1) for each in (
         mine.borne, {"honest": front.borne["honest"][[3], :6]}, mine.agents["universal"]
     ))  # fmt: skip
-    assert mine.harm_count == "honest" and (cost <= universal).all() and cost.mean() < 0.9 * papers.mean()
+    assert mine.harm_count == HarmCount.of("honest") and (cost <= universal).all() and cost.mean() < 0.9 * papers.mean()
     assert (mine.amounts[0] == pytest.approx(cost)) and (mine.borne["total"][0].sum(axis=1) <= cost + 1e-9).all()
 
 
@@ -172,7 +172,7 @@ def test_results__of_recorded_rows_have_intervals_by_recording() -> None:
     borne, by = full_braking(scenario, drawn), clusters_of(columns_of(drawn))
     some = {count: each[np.newaxis] for count, each in borne.items()}
     less = {count: 0.9 * each for count, each in some.items()}
-    front = Front(np.ones((1, scenario.vehicles)), "first", less, {"agent": some})
+    front = Front(np.ones((1, scenario.vehicles)), HarmCount.of("first"), less, {"agent": some})
     found = front_results(front, scenario, drawn, {"full_brake": borne}, 7)
     (point,), (driven,) = found["points"], found["agents"]["agent"]
     amounts = [weighted_harm(each["first"][0], front.weights[0]) for each in (less, some)]

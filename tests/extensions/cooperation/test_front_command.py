@@ -27,7 +27,7 @@ def test_front__writes_json_and_a_figure_and_prints_every_count(ethbrake: Comman
     assert {each["reference"] for each in found["hypervolume"]} == {"full braking", "largest harm of each vehicle"}
     with Image.open("out/front.png") as picture:
         assert picture.width > 700
-    for words in ("0,1,0", "full_brake", "maximin", "First", "All", "Honest", "e_v2x_bm", "Hypervolume"):
+    for words in ("0,1,0", "full_brake", "maximin", "First", "Total", "Honest", "e_v2x_bm", "Hypervolume"):
         assert words in answer.out
 
 

@@ -53,7 +53,7 @@ def test_file__has_the_episodes_of_an_evaluation(tmp_path: Path, monkeypatch: py
     for agent in ("full_brake", "ppo"):
         own = table.filter(table["agent"].to_numpy(zero_copy_only=False) == agent)
         harm = [-sum(own.filter(own["world"].to_numpy() == k)["reward_2"].to_pylist()) for k in range(5)]
-        assert harm == pytest.approx(result[agent]["first_impact_harm"].tolist(), abs=1e-9)
+        assert harm == pytest.approx(result[agent]["honest_cost"].tolist(), abs=1e-9)
         assert own["world"].to_pylist() == sorted(own["world"].to_pylist())
 
 

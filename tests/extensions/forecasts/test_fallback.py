@@ -11,7 +11,7 @@ from tests.fixtures.commands import Command
 
 def test_shipped_policies__all_have_a_range_and_universal_has_the_plan_as_its_fallback() -> None:
     ranges = {name: load_shipped(name).manifest.training_range for name in shipped_policies()}
-    assert len(ranges) == 10 and all(known is not None for known in ranges.values())
+    assert len(ranges) == 5 and all(known is not None for known in ranges.values())
     assert {name: known.fallback for name, known in ranges.items() if known.fallback} == {"universal": "plan.action"}
 
 

@@ -22,11 +22,11 @@ DIGESTS = {
     ("cooperation-2-paper", "blocked"): "20e03d350564f6dd",
     ("cooperation-2-paper", "congested"): "8d1f2519b99c126f",
     ("cooperation-2-paper", "old"): "4f4aa495d4933288",
-    ("cooperation-2-paper", "few"): "5827324b015522af",
+    ("cooperation-2-paper", "few"): "0fddb08f128c9d6b",
     ("cooperation-4-all", "blocked"): "776a728561fe4ddc",
     ("cooperation-4-all", "congested"): "b90a152a61b6d7e3",
     ("cooperation-4-all", "old"): "71171a6657d0d806",
-    ("cooperation-4-all", "few"): "f186f1f452cff758",
+    ("cooperation-4-all", "few"): "2c847acede908648",
 }
 
 

@@ -176,7 +176,7 @@ def test_rewards__of_exact_impacts_are_refused(reward, message: str) -> None:
 
 def test_record__is_refused() -> None:
     with refused("a record of the motion between decisions does not cover map"):
-        eb.record_episode(MAPPED, "coast")
+        eb.record_episode(MAPPED, "coast", harm_count="first")
 
 
 def test_watch__is_refused() -> None:
@@ -204,12 +204,14 @@ def test_honest_cost__of_exact_impacts_is_missing() -> None:
 def test_worlds__of_another_scenario_depart_by_the_map_or_are_refused() -> None:
     exact = eb.load_scenario("paper-random").sample(3, 7)
     with refused("does not cover map, by which world 0 departs"):
-        eb.evaluate(exact, "e_v2x_bm", scenario=MAPPED)
+        eb.evaluate(exact, "e_v2x_bm", scenario=MAPPED, harm_count="first")
     message = (
         "does not cover obstacle, by which world 0 departs from the plain game; departures that it covers: backward"
     )
     with refused(f"physics: paper-map {message}, map"):
-        eb.evaluate(eb.load_scenario("paper-random-obstacle").sample(3, 7), "full_brake", scenario=MAPPED)
+        eb.evaluate(
+            eb.load_scenario("paper-random-obstacle").sample(3, 7), "full_brake", scenario=MAPPED, harm_count="first"
+        )
     with refused("scenario 'paper-random' does not cover map, by which world 0"):
         eb.evaluate(MAPPED.sample(3, 7), "full_brake", scenario="paper-random")
 
@@ -217,7 +219,7 @@ def test_worlds__of_another_scenario_depart_by_the_map_or_are_refused() -> None:
 def test_tables__name_the_physics() -> None:
     exact = eb.load_scenario("paper-random")
     captions = [
-        eb.summarise(eb.evaluate(scenario, "full_brake", episodes=3)).tables()[0].note
+        eb.summarise(eb.evaluate(scenario, "full_brake", episodes=3, harm_count="first")).tables()[0].note
         for scenario in (exact.replace(physics="paper-map"), exact)
     ]
     assert "Worlds: paper-random (physics: paper-map): 3 worlds" in captions[0]
