@@ -60,7 +60,7 @@ class AgentSettings:
     options: Mapping[str, Any] = field(default_factory=dict)  # of ``eb.shield``; a name has none
 
     def needed_scenario(self) -> Scenario:
-        """Scenario in which the agent drives. Raises ``InvalidInput`` if it is unknown."""
+        """Raises ``InvalidInput`` if it is unknown."""
         if self.scenario is None:
             raise InvalidInput(
                 f"agent {self.spec!r}: needs a scenario, for instance make_agent({self.spec!r},"
@@ -165,14 +165,14 @@ def wrap_team(team: Team, wrapper: str, settings: AgentSettings) -> Team:
 
 
 def team_of(driver: Driver, scenario: Scenario) -> Team:
-    """Team for all learners of a scenario. A single agent drives every learner, with a separate memory for each."""
+    """A single agent drives every learner, with a separate memory for each."""
     if isinstance(driver, Team):
         return driver
     return Team(driver.name, dict.fromkeys(scenario.learners, driver))
 
 
 def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: AnyCount = HONEST) -> dict[str, Team]:
-    """Team of each spec: spec -> team. A group of agents is replaced by its specs.
+    """A group of agents is replaced by its specs.
 
     ``specs``: a list, or a text with commas. Raises the errors of ``make_agent``, and ``InvalidInput`` for a repeated
     spec.
@@ -187,10 +187,8 @@ def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: An
 
 
 def teams_of(agents: Any, scenario: Scenario, *, harm_count: AnyCount = HONEST) -> dict[str, Team]:
-    """Teams for any description of agents: name -> team.
-
-    ``agents`` is a text or list as in ``make_teams``; or a mapping from names to specs, agents, teams, or mappings from
-    vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``.
+    """``agents`` is a text or list as in ``make_teams``; or a mapping from names to specs, agents, teams, or mappings
+    from vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``.
     """
     if isinstance(agents, str) or (isinstance(agents, Iterable) and not isinstance(agents, Mapping)):
         return make_teams(agents, scenario, harm_count=harm_count)
@@ -220,7 +218,6 @@ def _driver(agent: Any, scenario: Scenario, harm_count: AnyCount) -> Any:
 
 
 def group(name: str) -> list[str]:
-    """Specs of a group: those of the entry ``name``, then of all entries ``NAME.MORE``; [] if ``name`` is no group."""
     if name not in AGENTS or callable(AGENTS[name].make):
         return []
     spec_lists: list[Any] = [AGENTS[entry].make for entry in AGENTS if entry == name or entry.startswith(f"{name}.")]
@@ -228,7 +225,7 @@ def group(name: str) -> list[str]:
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a text into specs (names of agents) at its commas. An existing path with a comma or plus is refused."""
+    """At commas. An existing path with a comma or plus is refused."""
     begins = [match.end() for match in re.finditer(r"^|[,@]", text)]
     ends = [match.end() for match in re.finditer(r"(?=[,+]|$)|\.py(?=:)", text)]
     for begin, end in product(begins, ends):
@@ -246,7 +243,6 @@ def check_path(path: str | os.PathLike[str]) -> None:
 
 
 def _make(core: str, settings: AgentSettings) -> Driver:
-    """Agent or team for a spec without wrappers."""
     if MODEL_FILE.fullmatch(core):
         raise InvalidInput(
             f"agent {core!r}: is a file; load it: {{'mine': eb.policy_agent(MODEL)}}, where MODEL is PPO.load({core!r})"
@@ -277,10 +273,7 @@ def _make(core: str, settings: AgentSettings) -> Driver:
 def _look_up(
     table: Registry[AgentEntry], name: str, argument: str, policy: str | None = None
 ) -> tuple[AgentEntry, str | None]:
-    """Entry of a table for a name with this argument, and the argument to pass to the entry's ``make``.
-
-    With a policy's path, a name that is no agent is taken for the algorithm that trained the policy.
-    """
+    """With a policy's path, a name that is no agent is taken for the algorithm that trained the policy."""
     rest, _, last = argument.rpartition(":")
     if argument and f"{name}.{last}" in table:
         return table[f"{name}.{last}"], rest or None
@@ -352,7 +345,7 @@ def require_learner(scenario: Scenario) -> None:
 
 
 def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
-    """Agents of the vehicles whose role is the name of an agent, by the vehicle's number (1: Vehicle 1)."""
+    """By the vehicle's number (1: Vehicle 1)."""
     scripts = {}
     for body, (vehicle, role) in enumerate(scenario.roles.items(), 1):
         if role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):
@@ -373,12 +366,11 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
 
 
 def listed_agents() -> list[AgentEntry]:
-    """Entries of all agents and wrappers that can be loaded, without groups."""
+    """Without groups."""
     agents = [entry for entry in AGENTS.usable().values() if callable(entry.make)]
     return agents + [replace(entry, form=f"+{entry.form}") for entry in WRAPPERS.usable().values()]
 
 
 def why_not_listed() -> list[str]:
-    """Error message of each agent or wrapper that cannot be loaded."""
     reasons = (table.why_not(name) for table in (AGENTS, WRAPPERS) for name in table)
     return [reason for reason in reasons if reason is not None]

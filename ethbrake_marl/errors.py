@@ -33,17 +33,14 @@ NAMES = {  # kind -> place of its names, or of a function that lists them; impor
 
 
 def plain_text(text: str, keep: str = "") -> str:
-    """Text in which Python escapes replace all unprintable characters except those in ``keep``.
-
-    So a name or path from a file cannot move the terminal's cursor or print backwards.
-    """
+    """Python escapes replace unprintable characters, so a name or path cannot move the terminal's cursor."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c in keep else c.encode("unicode_escape").decode() for c in text)
 
 
 def one_line(text: str) -> str:
-    """Printable text on one line, without its middle if it has more than ``LINE_LIMIT`` characters."""
+    """Without its middle if it has more than ``LINE_LIMIT`` characters."""
     blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
     line = plain_text(blanks)
     if len(text) == len(blanks) and len(line) <= LINE_LIMIT:
@@ -52,7 +49,7 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """Number with its noun, such as ``1 world`` or ``10,000 worlds``. ``thing`` is the noun in the singular."""
+    """Such as ``1 world`` or ``10,000 worlds``."""
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
 
@@ -61,7 +58,7 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
 
     ``path``: the user's file; the line is then the last one in the traceback that belongs to this file. None: the
     innermost line of code that is neither Python's own, nor an installed package's, nor this package's; without such
-    code the innermost line of another package, or no line. The class of this package's own errors is not named.
+    code the innermost line of another package, or no line.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -148,7 +145,7 @@ def naming_extras() -> Iterator[None]:
 
 
 def need(package: str) -> None:
-    """Raise ``MissingExtra`` unless the optional ``package`` is installed. The check does not import it."""
+    """The check does not import the package."""
     if find_spec(package) is None:
         raise _missing(package)
 
@@ -176,7 +173,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
 
 
 class AgentFailed(InvalidInput):
-    """A user's agent raised an exception or returned invalid actions. The message names agent, world and step.
+    """A user's agent raised an exception or returned invalid actions.
 
     ``row``: number of the world, or its row in the batch if the caller supplied the worlds; None: unknown. ``reason``:
     what went wrong, and at which step.
@@ -193,10 +190,7 @@ class AgentFailed(InvalidInput):
     @staticmethod
     @contextmanager
     def naming(name: str, other_agents: Collection[str] = ()) -> Iterator[None]:
-        """Context in which every ``AgentFailed`` gets ``name`` as the name of its agent.
-
-        ``other_agents``: names of other vehicles' agents, whose errors stay unchanged.
-        """
+        """Context that names the agent, except for errors of ``other_agents``."""
         try:
             yield
         except AgentFailed as error:
@@ -226,11 +220,9 @@ class FreeImpacts(UserWarning):
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Error for an unknown name. Its message says what else has this name, or suggests similar names, or lists
-    ``known``.
+    """Its message says what else has this name, or suggests similar names, or lists ``known``.
 
-    ``kind``: noun such as ``scenario``. ``may_be_own``: a message that lists names also says that a user's own part
-    must be registered first.
+    ``may_be_own``: a message that lists names also says that a user's own part must be registered first.
     """
     names, text = sorted({*known}), name if isinstance(name, str) else ""
     longer = [known_name for known_name in names if known_name.startswith(text)]
@@ -252,7 +244,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number in [``least``, ``most``]. ``what`` names ``value``."""
+    """Raises ``InvalidInput`` outside [``least``, ``most``]."""
     is_whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (is_whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"

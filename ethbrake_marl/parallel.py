@@ -38,15 +38,15 @@ class WorkerLost(EthBrakeError):
 
 
 def usable_cores() -> int:
-    """Number of cores that this process may use: all that its machine offers, or a worker's share of them."""
+    """All that the machine offers, or a worker's share of them."""
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return _SHARES.get(os.getpid(), available)
 
 
 def chosen_threads(threads: int | None) -> int:
-    """Number of threads of one computation: ``threads``, or None: the environment variable ``ETHBRAKE_THREADS``, or 1.
+    """None: the environment variable ``ETHBRAKE_THREADS``, or 1.
 
-    At most ``usable_cores``. Raises ``InvalidInput`` unless the number is a whole number from 1 to 1024.
+    At most ``usable_cores``. Raises ``InvalidInput`` unless it is a whole number from 1 to 1024.
     """
     if threads is None:
         text = os.environ.get(VARIABLE, "1")
@@ -128,9 +128,7 @@ def _pickle_call(call: Call) -> bytes:
 
 
 def _answer(caller: int, share: int, first: list[bytes], call: bytes) -> Any:
-    """Result of a pickled call, whose prints go to stderr.
-
-    A process other than ``caller`` (an id) becomes a worker, which may use ``share`` cores. It makes the calls
+    """A process other than ``caller`` (an id) becomes a worker, which may use ``share`` cores. It makes the calls
     ``first`` before this one.
     """
     with redirect_stdout(sys.stderr):
@@ -149,7 +147,7 @@ def _make(call: bytes) -> Any:
 
 @cache
 def _become_worker() -> None:
-    """Make this process a worker: ignore Ctrl-C (calls may still listen to it), and exit when the parent ends."""
+    """Ignore Ctrl-C (calls may still listen to it), and exit when the parent ends."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         if hasattr(signal, "pthread_sigmask"):

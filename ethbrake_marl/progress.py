@@ -38,7 +38,7 @@ class Progress:
 
     @property
     def harm(self) -> str:
-        """Harm in the last evaluation, such as ``total harm 24.19``; empty before the first evaluation."""
+        """Such as ``total harm 24.19``; empty before the first evaluation."""
         if self.objective and "objective" in self.metrics:
             return f"{self.objective} {self.metrics['objective']:.2f}"
         words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm", "honest_cost": "honest cost"}
@@ -47,16 +47,12 @@ class Progress:
 
     @property
     def measured(self) -> str:
-        """The harm, with the step at which it was measured if this is an earlier one."""
         step = self.metrics.get("steps", self.done)
         return f"{self.harm} at step {step:,.0f}" if self.harm and step != self.done else self.harm
 
     @staticmethod
     def listener(on_progress: ProgressOption) -> OnProgress | None:
-        """Function to call with each ``Progress``; None: no reports.
-
-        ``on_progress``: this function, None, or ``"show"``: print progress on stderr (if the process has one).
-        """
+        """``on_progress``: None: no reports; ``"show"``: on stderr (if the process has one)."""
         if on_progress == "show":
             return None if sys.stderr is None else ShownProgress()
         return on_progress
@@ -80,7 +76,6 @@ class ShownProgress:
         self._open = ""  # name of the task in the terminal's last line; empty if this line has ended
 
     def __call__(self, progress: Progress) -> None:
-        """Print the note, if any, and the progress: on a terminal always, otherwise at most every ten seconds."""
         now, task = time.monotonic(), progress.name.partition(": ")[0]
         if self._open not in ("", task) or progress.note:
             self.end()

@@ -57,7 +57,7 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """Entry points of a group such as ``agents``, by name: this package's first. Several packages may use one name."""
+    """By name, this package's first. Several packages may use one name."""
     by_name: dict[str, list[EntryPoint]] = {}
     foreign_points = [point for point in entry_points(group=f"ethbrake_marl.{group}") if giver(point) != DISTRIBUTION]
     for point in (
@@ -69,7 +69,7 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def package_points(group: str) -> list[EntryPoint]:
-    """Entry points of a group that this package itself defines, in the files ``contents.py`` of core and extensions."""
+    """Those in the files ``contents.py``."""
     package = __name__.rpartition(".")[0]
     folder = files(package) / "extensions"
     extensions = [path.name for path in folder.iterdir() if (path / "contents.py").is_file()] if folder.is_dir() else []
@@ -81,7 +81,6 @@ def package_points(group: str) -> list[EntryPoint]:
 
 
 def giver(point: EntryPoint) -> str:
-    """Name of the package that defines an entry point."""
     return DISTRIBUTION if point.dist is None else point.dist.name
 
 
@@ -117,7 +116,6 @@ class Registry(Mapping[str, T]):
         return name in self.loaded or name in points(self.group)
 
     def __iter__(self) -> Iterator[str]:
-        """Names: first built-in objects, then entry points, then objects registered by this process."""
         built_in = (name for name in self.loaded if name in self._built_in)
         return iter(dict.fromkeys([*built_in, *points(self.group), *self.loaded]))
 
@@ -133,8 +131,7 @@ class Registry(Mapping[str, T]):
         return self.loaded[name]
 
     def load(self, name: str) -> list[str]:
-        """Load an object if needed. Return all names that its entry point defines: several if its value is a
-        dictionary.
+        """All names that its entry point defines: several if its value is a dictionary.
 
         Raises the errors of looking up a name.
         """
@@ -157,7 +154,6 @@ class Registry(Mapping[str, T]):
                 self._loading.discard(name)
 
     def _load(self, name: str, point: EntryPoint) -> list[str]:
-        """Load an entry point and register all objects that it defines; return their names."""
         where = f"{self.kind} {name!r}, {point.value} of the installed package {giver(point)}"
         try:
             with naming_extras():
@@ -179,7 +175,7 @@ class Registry(Mapping[str, T]):
         return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
-        """Add ``part`` under a name. Raises ``AlreadyExists`` if another object has the name.
+        """Raises ``AlreadyExists`` if another object has the name.
 
         ``is_same(existing)`` says whether the object that already has the name equals ``part``; then nothing is added.
         """
@@ -196,11 +192,10 @@ class Registry(Mapping[str, T]):
             )
 
     def usable(self) -> dict[str, T]:
-        """Load all objects; return name -> object, without those that cannot be loaded."""
+        """Without those that cannot be loaded."""
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:
-        """Load an object; return the error message if this fails, else None."""
         try:
             self.load(name)
         except (InvalidInput, MissingExtra) as error:

@@ -124,7 +124,7 @@ def run_command(arguments: Sequence[str]) -> int:
 
 
 def _status_of(arguments: Sequence[str]) -> int:
-    """Exit status of a command. Typer, or a command of another package, may raise ``SystemExit`` to set it."""
+    """Typer, or a command of another package, may raise ``SystemExit`` to set it."""
     try:
         with naming_extras():
             command = whole_command()
@@ -147,10 +147,9 @@ def _interrupted() -> int:
 
 
 def prepare_streams() -> None:
-    """Set up stdout, stderr and warnings for the command line.
-
-    Characters that stdout's encoding lacks, such as m², are printed as ``?``. Text that libraries and child processes
-    write to stdout without Python's ``sys.stdout`` goes to stderr. Each warning of this package is printed on one line.
+    """Characters that stdout's encoding lacks, such as m², are printed as ``?``. Text that libraries and child
+    processes write to stdout without Python's ``sys.stdout`` goes to stderr. Each warning of this package is printed on
+    one line.
     """
     for name, mode in (("stdin", "r"), ("stdout", "r"), ("stderr", "w")):  # a closed stdout refuses results
         if getattr(sys, name) is None:  # closed by the caller: keep its number from the next file that is opened
@@ -173,7 +172,7 @@ def prepare_streams() -> None:
 
 
 def abandon_output() -> None:
-    """Discard output that cannot be written (full disk); otherwise Python would raise an error at exit."""
+    """Otherwise Python would raise an error at exit, for a full disk."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -203,7 +202,7 @@ COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.from
 
 
 class Installed(TyperCommand):
-    """A command of an extension or another installed package. Its code is imported only when the command is called.
+    """Its code is imported only when the command is called.
 
     ``entry``: name of the command's entry point, ``NAME`` or ``GROUP.NAME``.
     """
@@ -223,12 +222,12 @@ class Installed(TyperCommand):
         return self.command().make_context(*arguments, **settings)
 
     def get_short_help_str(self, limit: int = 45) -> str:
-        """Line of the command in ``ethbrake --help``. Another package is only named there, not imported."""
+        """Another package is only named, not imported."""
         return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
 
 
 def with_installed(group: Any, name: str) -> Any:
-    """Command group ``name``, to which this call adds the installed commands with entry points ``NAME.COMMAND``."""
+    """Adds the installed commands with entry points ``NAME.COMMAND``."""
     for entry in points(COMMANDS.group):
         owner, _, command_name = entry.rpartition(".")
         if owner == name:
@@ -237,13 +236,12 @@ def with_installed(group: Any, name: str) -> Any:
 
 
 def whole_command() -> Any:
-    """The program with all commands: the core's, those of installed packages, and those of ``add_command``."""
     return _build_commands(*COMMANDS, *COMMANDS.loaded.values())
 
 
 @cache
 def _build_commands(*registered: object) -> Any:
-    """The whole program, built once (100 ms) as long as the same names and commands are registered."""
+    """Built once (100 ms) as long as the same names and commands are registered."""
     program: Any = get_command(app)
     for name in _OURS:
         with_installed(program.commands[name], name)

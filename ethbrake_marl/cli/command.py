@@ -57,11 +57,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on s
 
 
 def schema_option(module: str, function: str, kind: str) -> Any:
-    """Type of the option ``--schema``, which prints a JSON Schema and exits.
-
-    ``function`` in ``module`` returns the schema; the module is imported only when the option is used. ``kind``: kind
-    of file that the schema describes, in words.
-    """
+    """``function`` in ``module`` returns the schema; the module is imported only when the option is used."""
 
     def show_schema(wants_schema: bool) -> None:
         if wants_schema:
@@ -73,16 +69,14 @@ def schema_option(module: str, function: str, kind: str) -> Any:
 
 
 def example(*lines: str) -> str:
-    """Text with examples, for the end of a help page. ``lines``: commands without the word ``ethbrake``."""
+    """``lines``: commands without the word ``ethbrake``."""
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 
 class Out:
-    """Output of a command, used as ``with Out() as out``.
-
-    Inside the block only results go to stdout; everything else, such as what a user's agent prints, goes to stderr.
-    Ctrl-C ends the command with exit status 130 and a message. ``remains``: end of this message, about files left
-    behind.
+    """In ``with Out() as out:`` only results go to stdout; everything else, such as what a user's agent prints, goes to
+    stderr. Ctrl-C ends the command with exit status 130 and a message. ``remains``: end of this message, about files
+    left behind.
     """
 
     def __init__(self, *, as_json: bool = False, force: bool = False, remains: str = "nothing was written") -> None:
@@ -93,7 +87,6 @@ class Out:
         self.unwritten: list[OSError | EthBrakeError] = []
 
     def __enter__(self) -> Self:
-        """Redirect stdout to stderr, and register the Gymnasium environments for the user's code."""
         self._turned.__enter__()
         register_environments()
         return self
@@ -112,17 +105,14 @@ class Out:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Context for writing results that are also printed: an error waits until the command has printed them."""
+        """An error waits until the command has printed the results."""
         try:
             yield
         except (OSError, EthBrakeError) as error:
             self.unwritten.append(error)
 
     def result(self, content: Any, *parts: RenderableType, in_file: bool = False) -> None:
-        """Print the result: ``content`` as JSON if the user chose ``--json``, otherwise ``parts``.
-
-        ``in_file``: whether a file also contains the result, so that nothing is lost if stdout is closed.
-        """
+        """``in_file``: whether a file also contains the result, so that nothing is lost if stdout is closed."""
         if in_file and not self._stdout.writable():
             return
         if self.as_json:
@@ -135,10 +125,7 @@ class Out:
         typer.echo(json.dumps(content, indent=2, allow_nan=False), self._stdout)
 
     def show(self, *parts: RenderableType, end: str = "\n") -> None:
-        """Print texts, each followed by ``end``, and tables of the library rich.
-
-        Control characters in texts are escaped, except line ends and tabs.
-        """
+        """Control characters in texts are escaped, except line ends and tabs."""
         self.show_progress.end()
         for part in parts:
             if isinstance(part, str):
@@ -152,7 +139,7 @@ class Out:
             typer.echo(one_line(text), err=True)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Raise an error, before any work, if a file cannot be written. ``path=None`` means no file.
+        """``path=None`` means no file.
 
         ``endings``: allowed file extensions, such as ``.csv``; none: all are allowed. ``what``: content of the file, in
         error messages. Raises ``InvalidInput``, or ``AlreadyExists`` without ``--force``.
@@ -166,7 +153,7 @@ class Out:
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
-        """Write a file completely or not at all. With ``what``, print ``WHAT: PATH`` on stderr."""
+        """With ``what``, prints ``WHAT: PATH`` on stderr."""
         from ethbrake_marl.files.store import write_output
 
         write_output(path, content.encode() if isinstance(content, str) else content, force=self.force)
@@ -182,7 +169,6 @@ class Out:
 
 
 def refuse(reason: Exception | str, status: int = 2) -> int:
-    """Print why a command failed, and return its exit status."""
     if isinstance(reason, OSError) and not isinstance(reason, EthBrakeError):
         reason = f"{reason.filename or 'output'!s:.200}: {reason.strerror or reason}"
     Out().note(f"ethbrake: error: {reason}")
@@ -190,7 +176,7 @@ def refuse(reason: Exception | str, status: int = 2) -> int:
 
 
 class _PlainConsole(Console):
-    """Console of the library rich that prints texts literally, without markup, and escapes control characters.
+    """Prints texts literally, without markup, and escapes control characters.
 
     In a notebook, it also prints to ``file``. ``width``: in characters; None: the terminal's width.
     """
@@ -199,10 +185,7 @@ class _PlainConsole(Console):
         super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False, force_jupyter=False)
 
     def on_broken_pipe(self) -> NoReturn:
-        """Raise the ``BrokenPipeError`` again.
-
-        Rich itself would discard stderr, where stdout is redirected, and exit.
-        """
+        """Rich itself would discard stderr, where stdout is redirected, and exit."""
         raise
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:

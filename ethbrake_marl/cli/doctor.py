@@ -29,7 +29,6 @@ class Check:
 
 
 def diagnose() -> list[Check]:
-    """Results of all checks, in the order in which the user should solve problems."""
     return [
         Check("ethbrake_marl", True, f"{__version__} in {_PACKAGE}"),
         Check("python", True, f"{platform.python_version()} at {sys.executable}"),
@@ -50,7 +49,7 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
-    """Check that each required package is installed, in a version that fits. Packages of extras may be missing."""
+    """Packages of extras may be missing."""
     from packaging.requirements import Requirement
 
     for requirement in map(Requirement, requires("ethbrake-marl") or []):

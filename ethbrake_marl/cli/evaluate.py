@@ -121,7 +121,6 @@ def _compare(
 def _show(
     out: Out, comparisons: dict[str, Comparison], output: Path | None, per_world: Any, page: str, *, is_benchmark: bool
 ) -> None:
-    """Write the results to the folder ``output``, if there is one, and print them."""
     from ethbrake_marl.evaluation.benchmark import benchmark_rows, benchmark_sheet
     from ethbrake_marl.evaluation.results import write_results
     from ethbrake_marl.evaluation.summary import summarise_lists
@@ -158,10 +157,7 @@ def _show(
 
 
 def _check_outputs(out: Out, output: Path | None, names: list[str], per_world: str | None, *, report: bool) -> None:
-    """Raise an error, before any work, if the result's files cannot be written or an option lacks a folder.
-
-    ``names``: scenarios of the group, each with a folder in ``output``; [] for a single scenario.
-    """
+    """``names``: scenarios of the group, each with a folder in ``output``; [] for a single scenario."""
     if output is None:
         for option, value in (("--per-world", per_world), ("--report", report)):
             if value:

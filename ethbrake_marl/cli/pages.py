@@ -10,9 +10,8 @@ from ethbrake_marl.registry import Registry
 
 
 def register_page(shows: str, write: Callable[..., None]) -> None:
-    """Register the function that writes a command's page (a report) or picture.
-
-    Packages use the entry-point group ``ethbrake_marl.pages`` instead.
+    """Register the function that writes a command's page or picture. Packages use the entry-point group
+    ``ethbrake_marl.pages`` instead.
 
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``), ``"worlds"`` (``scenario sample``) or
@@ -29,7 +28,7 @@ PAGES: Registry[Callable[..., Any]] = Registry("page", "pages", register_page)
 
 
 def page_function(shows: str, option: str) -> Callable[..., None]:
-    """Registered function for a page. Raises ``InvalidInput``, which begins with ``option``, if there is none."""
+    """Raises ``InvalidInput``, which begins with ``option``, if there is none."""
     if shows not in PAGES:
         raise InvalidInput(f"{option}: the extension that draws this page ({shows}) is not installed")
     return PAGES[shows]

@@ -94,7 +94,6 @@ def _trial_content(scenario: Scenario, trial: Trial) -> dict[str, Any]:
 
 
 def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
-    """Lines about a scenario's trial, for the user."""
     from ethbrake_marl.episode.counts import HarmCount
 
     n, ranges = trial.drawn.worlds.n, _ranges(trial)

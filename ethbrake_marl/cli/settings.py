@@ -17,8 +17,6 @@ NO_SETTING = {"name", "title", "description", "source", "scenario"}  # which can
 
 
 class CommandSettings(NamedTuple):
-    """Settings (``--set``) of a command, sorted by what they change."""
-
     texts: tuple[str, ...]  # as written
     scenario: list[Override]
     recipe: list[Override]
@@ -38,11 +36,8 @@ class CommandSettings(NamedTuple):
 def read_settings(
     texts: Sequence[str] | None, recipe_keys: Sequence[str] = (), of_command: Sequence[str] = ()
 ) -> CommandSettings:
-    """Sort the settings ``KEY=VALUE`` of a command by what they change: the scenario, the recipe or the command itself.
-
-    ``recipe_keys``, ``of_command``: valid keys of the recipe, and of the command. A key of both scenario and recipe is
-    written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName`` for an unknown key, and ``InvalidInput`` for an
-    ambiguous key or a bad value.
+    """A key of both scenario and recipe is written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName`` for an
+    unknown key, and ``InvalidInput`` for an ambiguous key or a bad value.
     """
     valid_keys = {"scenario": {*Scenario.model_fields} - NO_SETTING, "recipe": {*recipe_keys} - NO_SETTING}
     valid_keys["command"] = {*of_command}
@@ -73,10 +68,7 @@ def read_settings(
 
 
 def _of_reward(count: Override, overrides: Sequence[Override]) -> Override:
-    """The setting ``reward.harm_count`` of a recipe, for which ``harm_count`` is short.
-
-    Raises ``InvalidInput`` if one of ``overrides`` changes the same key.
-    """
+    """Raises ``InvalidInput`` if one of ``overrides`` changes the same key."""
     for override in overrides:
         path = override.path[1:] if override.top == "recipe" else override.path
         if path in (("reward",), ("reward", "harm_count")):

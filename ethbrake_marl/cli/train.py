@@ -121,17 +121,13 @@ def run_folder(scenario: str, recipe: str, scheme: str | None, seed: int) -> Pat
 
 
 def change_recipe(plan: TrainingRecipe, overrides: Any) -> TrainingRecipe:
-    """Recipe ``plan`` with the settings ``overrides`` of the command line."""
     from ethbrake_marl.files.overrides import Override
 
     return plan.replace(**Override.put(plan.model_dump(mode="json"), overrides)) if overrides else plan
 
 
 def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> None:
-    """Print the harm of the trained agent and of full braking, how the training ended, and how to evaluate the agent.
-
-    ``scenario``: name or path of the scenario in the printed command; None: the name in the run's folder.
-    """
+    """``scenario``: name or path of the scenario in the printed command; None: the name in the run's folder."""
     from ethbrake_marl.cli.settings import read_settings
     from ethbrake_marl.episode.counts import HONEST, IMPACT_COUNTS
     from ethbrake_marl.files.plain import read_object
@@ -187,7 +183,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
 
 
 def tell_end(out: Out, status: str, steps: int, directory: Path) -> None:
-    """Print how the training ended, and the run's folder. Exits with status 130 if the training was interrupted."""
+    """Exits with status 130 if the training was interrupted."""
     if status == "interrupted":
         hint = f"the policy so far is saved; continue with: ethbrake train --resume {shlex.quote(str(directory))}"
         out.interrupted(f"interrupted after {steps:,} training steps; {hint}")

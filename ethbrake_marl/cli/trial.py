@@ -20,7 +20,7 @@ COMPARED = {"full braking": "full_brake", "best constant deceleration": "e_v2x_b
 
 
 class Trial(NamedTuple):
-    """What happens in the first worlds of the evaluation list. All learners brake fully, except in ``harm``."""
+    """All learners brake fully, except in ``harm``."""
 
     drawn: DrawnWorlds
     early: int  # worlds with an impact before a learner can act
@@ -33,10 +33,7 @@ class Trial(NamedTuple):
 
 
 def try_scenario(scenario: Scenario) -> Trial:
-    """Simulate the first 200 worlds of the evaluation list, once with each agent in ``COMPARED`` driving the learners.
-
-    Raises the errors of scripts, which name vehicle, world and time.
-    """
+    """Raises the errors of scripts, which name vehicle, world and time."""
     count = HONEST if scenario.physics is None else ALL_IMPACTS
     loaded, game = open_game(scenario, reward={"harm_count": count})
     draw = loaded.draw(WORLDS, SEED)
@@ -77,7 +74,7 @@ def _to_the_end(game: Game, state: State) -> State:
 
 
 def _known_shares(scenario: Scenario, state: State) -> dict[str, dict[str, float]]:
-    """Learner -> other vehicle -> share of worlds in which the learner knows that vehicle when it can first act."""
+    """Learner -> other vehicle -> share of worlds in which the learner knows it when it can first act."""
     names: Any = scenario.vehicle_names
     acts_s = np.maximum(state.time_s[:, np.newaxis], state.latency_s)
     return {

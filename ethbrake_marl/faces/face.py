@@ -27,7 +27,7 @@ class Face:
     def _open(
         self, scenario_and_game: tuple[Scenario, Game], render_mode: str | None, most_steps: int | None = None
     ) -> None:
-        """Set the game of this environment. An episode is truncated after ``most_steps``; None: only at the horizon."""
+        """``most_steps``: None: only the horizon truncates an episode."""
         (self.scenario, self.game), self.render_mode = scenario_and_game, render_mode
         if most_steps is not None:
             check_whole_number("number of steps of an episode", most_steps, 1)
@@ -45,7 +45,7 @@ class Face:
         return self.episode
 
     def _running(self) -> State:
-        """The running episode, which changes only in ``_keep``. Raises ``InvalidInput`` if none is running."""
+        """It changes only in ``_keep``. Raises ``InvalidInput`` if none is running."""
         running = self._begun("step")
         if not self.begins_again and running.clock[0, ENDED] == 1.0:
             raise InvalidInput("step: no episode is running; call reset first")
@@ -60,7 +60,7 @@ class Face:
         self.stream, self.episode = stream, state
 
     def _rewards(self, step: Step) -> Floats:
-        """Rewards of a step, [n, B], or vector rewards, [n, B, K]."""
+        """[n, B], or vector rewards, [n, B, K]."""
         rewards: Floats = (step.reward if step.vector is None else step.vector).take(self.bodies - 1, axis=1)
         return rewards
 
@@ -72,11 +72,10 @@ class Face:
         return self.stream.describe(self._begun("describe_worlds"))
 
     def describe_world(self) -> dict[str, Any]:
-        """Drawn values of the first running world, as plain numbers and texts."""
+        """The first of ``describe_worlds``, as plain numbers and texts."""
         return {name: column.tolist()[0] for name, column in self.describe_worlds().items()}
 
     def render(self) -> Any:
-        """Pictures in the form that the render mode defines."""
         return self.renderer.render()
 
     def close(self, **kwargs: Any) -> None:

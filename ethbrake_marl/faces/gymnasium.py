@@ -24,13 +24,11 @@ from ethbrake_marl.worlds.scenario import plain
 
 
 class OneLearner(Face):
-    """A game with one learner, for Gymnasium's single and vector environments."""
-
     _spec: EnvSpec | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How Gymnasium made the environment: arguments as plain data, and the most steps of an episode."""
+        """How Gymnasium made the environment, as plain data."""
         return self._spec
 
     @spec.setter
@@ -42,7 +40,6 @@ class OneLearner(Face):
         self._spec = spec and replace(spec, kwargs=plain_arguments, max_episode_steps=self._longest())
 
     def _longest(self) -> int:
-        """Largest number of steps of an episode in the scenario's worlds."""
         first_s = min(self.scenario.bounds("latency_s")[i - 1][0] for i in self.game.deciders)
         settings = self.game.settings
         return int(min(steps_to_horizon(first_s, settings), settings.most_steps))
@@ -50,7 +47,6 @@ class OneLearner(Face):
     def _open_one(
         self, game: tuple[Any, ...], render_mode: str | None, actions: int | None, most_steps: int | None
     ) -> tuple[Any, Any]:
-        """Set the game of this environment, from arguments of ``open_game``; return observation and action space."""
         self._open(open_game(*game), render_mode, most_steps)
         self.bodies, self.actions = self.game.settings.learners, actions
         names = [self.scenario.vehicle_names[i - 1] for i in self.bodies]

@@ -122,7 +122,6 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 
     @property
     def agents(self) -> list[str]:
-        """Names of the agents whose episode is running."""
         running = self.episode is not None and self.episode.clock[0, ENDED] == 0.0
         return self.possible_agents[:] if running else []
 
@@ -133,7 +132,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return self.action_spaces[agent]
 
     def reward_space(self, agent: str) -> Any:
-        """Space of an agent's vector rewards. Raises ``InvalidInput`` if rewards are numbers."""
+        """Raises ``InvalidInput`` if rewards are numbers."""
         if not self.game.rewarding.components:
             raise InvalidInput("reward_space: rewards are numbers here; make the environment with reward_vector")
         return self.reward_spaces[agent]
@@ -209,7 +208,7 @@ parallel_env = EthBrakeParallelEnv
 
 
 class OrderedTurns(OrderEnforcingWrapper):  # type: ignore[misc]
-    """PettingZoo's check of the order of calls, with a ``last`` that looks up fewer attributes."""
+    """PettingZoo's check, with a ``last`` that looks up fewer attributes."""
 
     def last(self, observe: bool = True) -> tuple[Any, ...]:
         return self.env.last(observe) if self._has_reset else super().last(observe)  # type: ignore[no-any-return]

@@ -14,7 +14,7 @@ ENTRIES: dict[str, Any] = {
 
 
 def register_environments() -> None:
-    """Register all environments that are not yet registered. PettingZoo has a registry from version 1.27 on."""
+    """PettingZoo has a registry from version 1.27 on."""
     import gymnasium  # imported here, because the import takes time
     import pettingzoo
 

@@ -13,7 +13,7 @@ FRAMES_PER_SECOND = 10
 
 
 class Renderer:
-    """Draws the episodes of one environment. This base class draws nothing (``render_mode=None``)."""
+    """The base class draws nothing (``render_mode=None``)."""
 
     def began(self, state: State) -> None:
         """Called after a reset."""
@@ -22,7 +22,7 @@ class Renderer:
         """Called after a step."""
 
     def render(self) -> Any:
-        """Pictures in the form that the render mode defines; for many worlds, a list."""
+        """For many worlds, a list."""
 
     def close(self) -> None:
         """Close windows and files."""
@@ -34,7 +34,7 @@ MakeRenderer = Callable[[Any], Any]
 
 
 def register_renderer(mode: str, make: MakeRenderer) -> None:
-    """Register a render mode: ``make(environment)`` returns its renderer. Entry points: ``ethbrake_marl.renderers``."""
+    """``make(environment)`` returns its renderer. Entry points: ``ethbrake_marl.renderers``."""
     RENDERERS.add(mode, make, lambda registered: registered is make)
 
 
@@ -42,7 +42,7 @@ RENDERERS: Registry[MakeRenderer] = Registry("render mode", "renderers", registe
 
 
 def why_not(mode: str, many: bool = False) -> str | None:
-    """Why a render mode cannot draw one world (``many``: many worlds) on this machine; None if it can."""
+    """None if this machine can draw one world (``many``: many worlds) in the mode."""
     try:
         getattr(RENDERERS[mode], "check", bool)(many)
     except EthBrakeError as error:
@@ -51,7 +51,6 @@ def why_not(mode: str, many: bool = False) -> str | None:
 
 
 def render_metadata(many: bool = False) -> dict[str, Any]:
-    """Entries of an environment's ``metadata`` about pictures, with the modes that work on this machine."""
     return {
         "render_modes": [mode for mode in RENDERERS if why_not(mode, many) is None],
         "render_fps": FRAMES_PER_SECOND,
@@ -59,7 +58,7 @@ def render_metadata(many: bool = False) -> dict[str, Any]:
 
 
 class Metadata:
-    """The attribute ``metadata`` of an environment's class. Reading it imports the packages that draw."""
+    """Reading it imports the packages that draw."""
 
     def __init__(self, **entries: Any) -> None:
         self.other = entries
@@ -69,7 +68,7 @@ class Metadata:
 
 
 def make_renderer(environment: Any, mode: str | None) -> Any:
-    """Renderer for a render mode. Raises ``InvalidInput`` for an unknown mode."""
+    """Raises ``InvalidInput`` for an unknown mode."""
     if mode is None:
         return Renderer()
     if mode not in RENDERERS:

@@ -113,7 +113,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         self.seed(seed)
 
     def _features(self) -> tuple[Feature, ...]:
-        """Features of a row: those that all learners observe, and the appended numbers."""
+        """Those that all learners observe, and the appended numbers."""
         views = {self.game.views[i] for i in self.bodies}
         if len(views) > 1:
             raise InvalidInput(
@@ -135,7 +135,6 @@ class EthBrakeVecEnv(Face, VecEnv):
         return self._seeds
 
     def reset(self) -> Observations:
-        """Start an episode in every world: the next worlds of the seed, or those that ``set_options`` chose."""
         options = self._options
         if options != options[:1] * self.num_envs:
             self._reset_options()
@@ -153,7 +152,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         self._given = actions
 
     def step_wait(self) -> tuple[Observations, Any, Bools, list[dict[str, Any]]]:
-        """Advance every world by one time step; where an episode ends, the next one begins in the same rows."""
+        """Where an episode ends, the next one begins in the same rows."""
         before = self._running()
         actions = checked_actions(self._given, (self.num_envs, 1), "the learners", self.actions)
         state, step = self.game.step(before, actions.reshape(self.n, -1))
@@ -183,10 +182,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         return observations, reward.astype(np.float32), over.repeat(len(self.bodies)), infos
 
     def _last_infos(self, state: State, step: Step, ended: Any) -> list[dict[str, Any]]:
-        """Infos of each learner at the end of an episode, in the worlds ``ended`` (indices).
-
-        ``step``: last step of all worlds, which led to ``state``.
-        """
+        """``step``: last step of all worlds, which led to ``state``."""
         terms = {name: term[ended] for name, term in step.terms.items()}
         step = step._replace(reward=step.reward[ended], out=step.out[:, ended], terms=terms)
         cut = (step.truncated & (not self.horizon_is_end)).repeat(len(self.bodies)).tolist()
@@ -205,7 +201,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         """Ignore the empty infos of Stable-Baselines3's constructor."""
 
     def _observe(self, state: State) -> Observations:
-        """Observations of all rows, with the appended numbers, [n L, F] float32."""
+        """All rows, [n L, F] float32."""
         L, every = len(self.bodies), self.game.observe_alike(state, self.bodies)
         rows: Observations = every.reshape(-1, every.shape[2])
         if self.appended is None:
@@ -216,12 +212,11 @@ class EthBrakeVecEnv(Face, VecEnv):
         return np.concatenate([rows, more], axis=1, dtype=np.float32)
 
     def snapshot(self) -> dict[str, Any]:
-        """Everything that ``restore`` needs to continue from the present state, as arrays and numbers."""
         stream = [self.stream.seed, self.stream.next]
         return copy.deepcopy({"stream": stream, **{name: getattr(self, name) for name in SAVED}})
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Continue from a ``snapshot``. The same snapshot can be restored several times."""
+        """The same snapshot can be restored several times."""
         saved = copy.deepcopy(saved)
         seed, following = saved["stream"]
         self.stream = self.stream._replace(seed=seed, next=following)
@@ -243,7 +238,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Call a method once; return its result once per row. Raises ``InvalidInput`` if ``indices`` omit a row."""
+        """The result once per row. Raises ``InvalidInput`` if ``indices`` omit a row."""
         self._refuse_some_rows("env_method", indices)
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
 

@@ -91,10 +91,7 @@ def guard_team(team: Team, mode: str, scenario: Scenario | None, count: HarmCoun
 
 
 def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Team], Team], count: HarmCount) -> Any:
-    """Shielded copy of an environment. If ``policy`` is the name of an agent, this agent minimises ``count``.
-
-    ``base`` is ``env`` without wrappers; ``around`` puts the shield around a team.
-    """
+    """If ``policy`` is the name of an agent, this agent minimises ``count``."""
     if isinstance(env, type) or not isinstance(base, Face):
         raise InvalidInput(
             f"shield: {env!r:.80}: must be a team, an agent, or an environment made by eb.parallel_env, eb.env,"
@@ -117,7 +114,7 @@ def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Tea
 
 
 def with_game(env: Any, game: Game) -> Any:
-    """Copy of an environment and its wrappers with another ``game``, without a running episode."""
+    """With its wrappers, without a running episode."""
     base = env.unwrapped
     instead = {id(base.game): game, id(base.scenario): base.scenario, id(base.episode): None, id(base.renderer): None}
     env_copy = copy.deepcopy(env, instead)

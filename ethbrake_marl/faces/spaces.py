@@ -15,7 +15,7 @@ from ethbrake_marl.motion.layout import Floats
 
 
 def feature_box(features: Sequence[Feature]) -> Box:
-    """Float32 box of observations. Its attribute ``features`` names its entries, and is saved with a model.
+    """Its attribute ``features`` names its entries, and is saved with a model.
 
     The class is ``Box`` itself, because libraries look up the exact class of a space.
     """
@@ -26,12 +26,12 @@ def feature_box(features: Sequence[Feature]) -> Box:
 
 
 def reward_box(components: Sequence[Any]) -> Box:
-    """Space of vector rewards, [components]; float64, so a weighted sum equals the scalar reward to the last bit."""
+    """float64, so a weighted sum equals the scalar reward to the last bit."""
     return Box(-np.inf, np.inf, (len(components),), np.float64)
 
 
 def action_space(count: int | None) -> Any:
-    """Action space of one learner: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices.
+    """A box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices.
 
     The indices stand for evenly spaced actions; the space has an attribute ``evenly_spaced`` that says so.
     """
@@ -47,8 +47,8 @@ def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, coun
     """Actions as a float64 array of ``shape``. The input may have more or fewer axes of length 1.
 
     With ``count`` the input consists of indices: index k stands for the action ``(2 k - count + 1) / (count - 1)``.
-    ``whose``: who acts, in messages. Raises ``InvalidInput`` for a wrong shape or index, and for values that are not
-    numbers. The range [-1, 1] is checked later, in ``Game.step``.
+    Raises ``InvalidInput`` for a wrong shape or index, and for values that are not numbers. The range [-1, 1] is
+    checked later, in ``Game.step``.
     """
     try:
         numbers = np.asarray(actions)

@@ -61,25 +61,18 @@ class Stream(NamedTuple):
         return self._replace(seed=chosen, next=after, option_worlds=option_worlds), self.game.reset(worlds)
 
     def next_episodes(self, rows: Ints) -> tuple[Stream, State]:
-        """Stream for later episodes, and a new episode in the next world for each of ``rows``.
-
-        The new episodes share no arrays with others.
-        """
+        """The new episodes share no arrays with others."""
         worlds, after = self._draw(rows, self.seed, self.next)
         return self._replace(next=after), self.game.reset(worlds)
 
     def _draw(self, rows: Ints, seed: Any, first: Any) -> tuple[State, Any]:
-        """Next world of each of ``rows``, and the value of ``next`` after it."""
         if isinstance(seed, int):
             return self.game.draw(len(rows), seed, first), first + len(rows)
         row_worlds = [self.scenario.sample(1, int(seed[k]), first=int(first[k]), purpose="training") for k in rows]
         return State.join(row_worlds), first + np.isin(np.arange(len(first)), rows)
 
     def seeds_of(self, state: State, rows: Any = slice(None)) -> Any:
-        """Seed of each running world, or of the worlds of ``rows``; -1 for a world that the caller supplied.
-
-        ``state``: state of these worlds.
-        """
+        """-1 for a world that the caller supplied."""
         seed = self.seed if isinstance(self.seed, int) else exact_array(self.seed)[rows]
         if self.option_worlds is None:
             return seed
@@ -87,7 +80,7 @@ class Stream(NamedTuple):
         return exact_array(np.where(is_of_options, self.option_worlds[1], np.asarray(seed, object)).tolist())
 
     def describe(self, state: State) -> dict[str, Any]:
-        """Drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
+        """Name such as ``gap_1_m`` or ``scenario`` -> [n]."""
         index, seeds = state.clock[:, NUMBER].astype(np.int64), np.full(state.n, self.seed, object)
         place, parts = np.arange(state.n), [] if self.option_worlds is None else [self.option_worlds[0]]
         of_stream = np.flatnonzero(index >= 0)
@@ -99,7 +92,7 @@ class Stream(NamedTuple):
         return {**columns, "world_seed": np.full(state.n, self.seeds_of(state)), "world": world}
 
     def _worlds_of_options(self, n: int, options: Any) -> tuple[DrawnWorlds, int] | None:
-        """Worlds that ``options`` of a reset specify, and their seed (-1: no seed); None if there are none."""
+        """With their seed (-1: no seed); None if there are none."""
         if options is None:
             return None
         if not isinstance(options, Mapping):
@@ -141,7 +134,7 @@ def exact_array(values: Sequence[int]) -> NDArray[Any]:
 
 
 def chosen_seed(seed: int | None) -> int:
-    """The seed, or a random seed of 63 bits for None. Raises ``InvalidInput`` for a bad seed."""
+    """A random seed of 63 bits for None. Raises ``InvalidInput``."""
     if seed is None:
         return int.from_bytes(np.random.SeedSequence().generate_state(2).tobytes(), "little") % 2**63
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:

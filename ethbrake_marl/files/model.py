@@ -48,7 +48,6 @@ class FileModel(BaseModel):
 
     @classmethod
     def key_fields(cls) -> Mapping[str, FieldInfo]:
-        """Field of each valid key, for error messages."""
         return cls.model_fields
 
 
@@ -58,9 +57,7 @@ UNSHOWN = object()  # passed as a value, means: do not show the value in the err
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    """Raise the error for an invalid ``value``, inside a pydantic validator.
-
-    ``at``: path of the value inside the validated field (``()``: the field itself). ``right``: what would be valid,
+    """``at``: path of the value inside the validated field (``()``: the field itself). ``right``: what would be valid,
     such as ``must be above 0``.
     """
     value_text = "" if value is UNSHOWN else flow_text(value, 60)
@@ -73,13 +70,12 @@ def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
 
 
 class Wording:
-    """Parts of error messages about one kind of file. Subclasses override them. An empty text is left out."""
+    """Subclasses override these parts of error messages. An empty text is left out."""
 
     def __init__(self, model: type[FileModel], needed: str = "") -> None:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
-        """Keys that would be valid in place of the last key of ``path``."""
         models = [self.model]
         for key in path[:-1]:
             fields = [model.key_fields().get(str(key)) for model in models]
@@ -88,24 +84,20 @@ class Wording:
         return list(dict.fromkeys(f.alias or name for model in models for name, f in model.key_fields().items()))
 
     def needed(self, path: YamlPath) -> str:
-        """Advice about the missing key at ``path``."""
         return self._needed
 
     def instead(self, key: str) -> str:
-        """Advice about what to write instead of the unknown ``key``."""
         return ""
 
     def owner(self, path: YamlPath) -> str:
-        """Name of the vehicle or pair that the value at ``path`` describes."""
         return ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Text about what would be valid in place of a value that pydantic rejects; empty: use the general text."""
         return ""
 
 
 def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
-    """Error to raise for ``error``: about the first unknown key, or else the first mistake that pydantic reports."""
+    """About the first unknown key, or else the first mistake that pydantic reports."""
     # A default that depends on an invalid field is no mistake of its own.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
     detail = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
@@ -122,7 +114,7 @@ def models_in(annotation: Any) -> Iterator[type[FileModel]]:
 
 
 def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
-    """Content of a YAML file or document, as ``model``. Raises ``InvalidInput`` for the first mistake.
+    """Raises ``InvalidInput`` for the first mistake.
 
     ``advice`` ends the message "must be a mapping ..." for a file without a mapping.
     """
@@ -145,8 +137,6 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 
 
 class Mistake(NamedTuple):
-    """A mistake in data from a program. Its text says where the mistake is and what would be valid."""
-
     place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
     value: Any  # the invalid value
     right: str  # what would be valid
@@ -162,16 +152,12 @@ def first_mistake(error: ValidationError) -> Mistake:
 
 
 def path_of(detail: ErrorDetails) -> YamlPath:
-    """Path, in the file, of a mistake that pydantic reports.
-
-    Pydantic's tags of unions are removed. If ``refuse`` raised the error, its argument ``at`` is appended.
-    """
+    """Pydantic's tags of unions are removed. If ``refuse`` raised the error, its argument ``at`` is appended."""
     keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
     return (*keys, *detail.get("ctx", {}).get("at", ()))
 
 
 def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
-    """Message about a mistake: place, invalid value, and what would be valid."""
     place = _place(path, wording)
     if detail["type"] == "extra_forbidden":
         inside = wording.known(path)
@@ -188,7 +174,7 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 
 
 def _show(detail: ErrorDetails) -> str:
-    """Text of the invalid value, empty for a whole file. A float where an integer is needed keeps its point."""
+    """Empty for a whole file. A float where an integer is needed keeps its point."""
     value = detail["input"]
     if isinstance(value, BaseModel) or not detail["loc"]:
         return ""
@@ -202,14 +188,12 @@ def _place(path: YamlPath, wording: Wording) -> str:
 
 
 def _unquote(detail: ErrorDetails) -> str:
-    """Advice about a number in quotes, which YAML reads as text."""
     value = detail["input"]
     quoted = detail["type"] == "float_type" and isinstance(value, str) and parse_numeral(value) is not None
     return "must be a number, not text; write it without quotes" if quoted else ""
 
 
 def _right(detail: ErrorDetails) -> str:
-    """General text about what would be valid."""
     kind = detail["type"]
     if detail["input"] != detail["input"]:  # NaN
         return "must be a finite number"
@@ -232,7 +216,7 @@ def _right(detail: ErrorDetails) -> str:
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:
-    """Text "did you mean ...?" for an unknown ``key``; empty if no known key is similar.
+    """Empty if no known key is similar.
 
     A key with a wrong or missing unit, such as ``gaps_km`` or ``mass``, is also recognised.
     """

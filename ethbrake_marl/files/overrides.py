@@ -13,7 +13,7 @@ from ethbrake_marl.files.yaml import flow_text, parse_yaml
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """A setting such as ``reward.harm=0.5``, split into a path of keys and a value."""
+    """Such as ``reward.harm=0.5``."""
 
     text: str  # the setting as written
     path: tuple[str, ...]  # keys that lead to the value, the outermost first; indices (from 0) inside lists
@@ -21,24 +21,19 @@ class Override:
 
     @property
     def top(self) -> str:
-        """First key, such as ``reward``."""
         return self.path[0]
 
     @property
     def key(self) -> str:
-        """The whole path, such as ``reward.harm``."""
         return ".".join(self.path)
 
     def inside(self) -> Override:
-        """The setting without its first key: ``harm=0.5`` for ``reward.harm=0.5``."""
+        """``harm=0.5`` for ``reward.harm=0.5``."""
         return Override(self.text, self.path[1:], self.value)
 
     @staticmethod
     def parse(texts: Sequence[str]) -> list[Override]:
-        """Settings from texts ``key.path=value``; a value is YAML on one line, such as ``{uniform: [1, 2]}``.
-
-        Raises ``InvalidInput`` for a text without ``=``, an empty key, a repeated path, or a value that is not YAML.
-        """
+        """Raises ``InvalidInput`` for no ``=``, an empty key, a repeated path, or a value that is no YAML."""
         overrides: list[Override] = []
         for text in texts:
             key, equals, value = text.partition("=")
@@ -52,10 +47,8 @@ class Override:
 
     @staticmethod
     def put(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-        """Apply settings to a copy of ``content``; return the changed top-level keys with their new values.
-
-        With ``content = {"reward": {"harm": 1}, "seed": 3}``, the setting ``reward.harm=2`` gives ``{"reward": {"harm":
-        2}}``. Raises ``InvalidInput`` if a path leads into something other than a mapping or a list.
+        """With ``content = {"reward": {"harm": 1}, "seed": 3}``, the setting ``reward.harm=2`` gives ``{"reward":
+        {"harm": 2}}``. Raises ``InvalidInput`` if a path leads into something other than a mapping or a list.
         """
         changed: dict[str, Any] = {}
         for override in overrides:
@@ -66,7 +59,7 @@ class Override:
 
 
 def _place_value(part: Any, path: tuple[str, ...], override: Override) -> Any:
-    """Copy of ``part`` with the override's value at ``path``; missing mappings are created."""
+    """Missing mappings are created."""
     if not path:
         return override.value
     key, rest = path[0], path[1:]

@@ -24,7 +24,7 @@ def read_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> bytes:
-    """Content of a plain file. Arguments and errors are those of ``open_plain``."""
+    """As ``open_plain``."""
     with open_plain(path, limit_bytes, refusal=refusal, follow_links=follow_links) as stream:
         data = stream.read(limit_bytes + 1)  # files of /proc say that they are empty, and a file may grow
     if len(data) > limit_bytes:
@@ -40,10 +40,8 @@ def open_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> Iterator[BufferedReader]:
-    """Open a plain file (no folder, pipe or device) of at most ``limit_bytes``.
-
-    Kind and size are checked first, so pipes and devices are never opened. Raises ``refusal`` with path and reason if
-    the file does not exist, is not plain, is a symbolic link (unless ``follow_links``), is too large or cannot be
+    """Kind and size are checked first, so pipes and devices are never opened. Raises ``refusal`` with path and reason
+    if the file does not exist, is not plain, is a symbolic link (unless ``follow_links``), is too large or cannot be
     opened.
     """
     file = Path(path)
@@ -82,7 +80,7 @@ def parse_strict_json(data: bytes) -> Any:
 
 
 def read_object(file: Path) -> dict[str, Any]:
-    """JSON object in a file of a training run. Raises ``InvalidInput`` if the file is missing or damaged."""
+    """Raises ``InvalidInput`` if the file is missing or damaged."""
     data = read_plain(file, LARGEST_OBJECT_BYTES)
     try:
         content = parse_strict_json(data)

@@ -31,15 +31,12 @@ def load_file(path: str) -> None:
 
 
 def loaded_files() -> list[str]:
-    """Paths of the files of ``load_file``."""
     return [path for path, (function, *_) in PREPARATIONS.items() if function is run_file]
 
 
 def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
-    """Object ``name`` that a Python file defines (``run_file``).
-
-    ``reads``: another file that the code uses, such as weights; its SHA-256 is recorded, too. Raises ``InvalidInput``
-    also if the file does not define ``name``.
+    """``reads``: another file that the code uses, such as weights; its SHA-256 is recorded, too. Raises
+    ``InvalidInput`` also if the file does not define ``name``.
     """
     module = run_file(path)
     if not hasattr(module, name):
@@ -53,16 +50,13 @@ def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
 
 
 def files_run() -> dict[str, str]:
-    """SHA-256 of every Python file that this process ran, and of the files that they use: file name -> hash.
-
-    If several files have the same name, their hashes are separated by commas.
-    """
+    """SHA-256 of every Python file that this process ran, and of the files that they use: file name -> hash."""
     names = dict.fromkeys(path.name for path in _SHA256)
     return {name: ", ".join(sorted({sha for path, sha in _SHA256.items() if path.name == name})) for name in names}
 
 
 def run_file(file: str) -> ModuleType:
-    """Module of a Python file. The file runs once per process, and its code has all rights of the user.
+    """The file runs once per process, and its code has all rights of the user.
 
     Raises ``InvalidInput`` if the file is missing, fails, or has changed since it ran.
     """
@@ -80,7 +74,7 @@ def run_file(file: str) -> ModuleType:
 
 
 def _run(content: bytes, path: Path, sha256: str, what: str) -> None:
-    """Run a Python file as a new module. Raises ``InvalidInput`` if its code fails."""
+    """Raises ``InvalidInput`` if the code fails."""
     module = ModuleType(f"ethbrake_file_{path.stem}_{sha256[:12]}")
     module.__file__ = str(path)
     _RUN[path] = sys.modules[module.__name__] = module

@@ -19,8 +19,6 @@ DASH = "–"  # shown for a missing value
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """An estimated number with its 95 % interval."""
-
     value: float
     interval: tuple[float, float] | None  # low and high end; None if it cannot be computed, as for one world
     # standard error, and its degrees of freedom; None where they are not known
@@ -29,20 +27,20 @@ class Estimate:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Low and high end of the interval; both equal the value if there is none."""
+        """Both equal the value if there is no interval."""
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """Text of value and interval, both times ``scale``, such as ``24.19 [23.85, 24.53]``."""
+        """Such as ``24.19 [23.85, 24.53]``; ``scale`` is a factor."""
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for JSON: ``{"value": ..., "interval": [low, high] or None}``."""
+        """``{"value": ..., "interval": [low, high] or None}``."""
         return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-        """Estimates as flat data for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; None for unknown ones."""
+        """``{"x": 1.5, "x_interval": [1.0, 2.0]}``; None for unknown ones."""
         cells: dict[str, Any] = {}
         for name, estimate in estimates.items():
             cells[name] = None if estimate is None else estimate.value
@@ -53,8 +51,6 @@ class Estimate:
 
 
 class CellText(NamedTuple):
-    """Text of a table's cell: the value, and the interval if there is one."""
-
     value: str  # the number with its unit, or the text
     interval: str = ""  # ``23.85, 24.53``
 
@@ -68,7 +64,7 @@ Cell = Estimate | CellText | float | int | str | None
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column, with the format of its numbers. Integers and texts are shown as they are."""
+    """Integers and texts are shown as they are."""
 
     heading: str  # heading in documents
     key: str = ""  # name in CSV and JSON; "": the heading
@@ -85,7 +81,7 @@ class Column:
         return self.key or self.heading
 
     def show(self, cell: Cell) -> CellText:
-        """Text of a cell; a dash for None."""
+        """A dash for None."""
         if cell is None or isinstance(cell, CellText):
             return cell or CellText(DASH)
         if isinstance(cell, str | int):
@@ -96,7 +92,7 @@ class Column:
         return CellText(self._number(cell.value) + self.unit, ", ".join(map(self._number, ends)))
 
     def in_terminal(self, cell: CellText) -> str:
-        """Text of a cell in a terminal. A second line (the interval) is shown dim."""
+        """A second line (the interval) is shown dim."""
         if self.interval == "beside":
             return cell.in_words
         return cell.value + (f"\n{cell.interval}" if cell.interval and self.interval == "below" else "")
@@ -130,7 +126,6 @@ class Sheet:
 
     @property
     def formats(self) -> list[Column]:
-        """The columns, each with its format."""
         return [column if isinstance(column, Column) else Column(column, text=True) for column in self.columns]
 
     @property
@@ -142,7 +137,7 @@ class Sheet:
         return [column.name for column in self.formats]
 
     def formatted_rows(self) -> Iterator[str | tuple[CellText, ...]]:
-        """Rows of the table: a tuple of formatted cells, or the name of a section that begins."""
+        """A tuple of formatted cells, or the name of a section that begins."""
         columns = self.formats
         for row in self.rows:
             if isinstance(row, str):
@@ -152,20 +147,20 @@ class Sheet:
                 yield (*cells, *[CellText("")] * (len(columns) - len(cells)))
 
     def only(self, columns: Iterable[int]) -> Sheet:
-        """Table with only these columns (indices from 0)."""
+        """Indices from 0."""
         names = list(columns)
         rows = [row if isinstance(row, str) else [row[k] for k in names if k < len(row)] for row in self.rows]
         return replace(self, columns=[self.columns[k] for k in names], rows=rows)
 
     def filled(self) -> list[int]:
-        """Indices of the columns with a value in some row; all indices if the table has no rows."""
+        """Columns with a value in some row; all if the table has no rows."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
         ]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Table for a terminal, with the note below. Texts that do not fit are folded."""
+        """With the note below. Texts that do not fit are folded."""
         from rich import box
         from rich.table import Table
         from rich.text import Text
@@ -201,7 +196,7 @@ class Sheet:
             yield Text(f"\n{self.note}", "dim")
 
     def _fitting(self, width: int, rows: Sequence[Sequence[str]]) -> int:
-        """Number of columns that fit into ``width`` characters, at least ``keep``."""
+        """``width`` in characters; at least ``keep``."""
         columns = self.formats
         texts = [[column.short or column.heading, *(row[k] for row in rows)] for k, column in enumerate(columns)]
         wide = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
@@ -212,7 +207,7 @@ class Sheet:
         return column_count
 
     def json(self) -> list[dict[str, Any]]:
-        """One mapping per row, column name -> cell, without names of sections. An interval has an entry of its own."""
+        """Column name -> cell, without names of sections. An interval has an entry of its own."""
         rows = []
         for row in self.rows:
             if not isinstance(row, str):
@@ -227,7 +222,6 @@ class Sheet:
 
 
 def terminal_text(*parts: RenderableType) -> str:
-    """Tables and texts as plain text, as wide as the terminal, in characters that stdout can print."""
     from rich.console import Console
 
     encoding = getattr(sys.stdout, "encoding", None) or "utf-8"  # such as cp1252 or ASCII
@@ -240,7 +234,7 @@ def terminal_text(*parts: RenderableType) -> str:
 
 
 def flat_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Copy of a row in which two entries, ``x_low`` and ``x_high``, replace each pair ``x_interval``."""
+    """``x_low`` and ``x_high`` replace each pair ``x_interval``."""
     line: dict[str, Any] = {}
     for name, value in row.items():
         if name.endswith("_interval"):
@@ -252,9 +246,7 @@ def flat_row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Rows as CSV text, after ``flat_row``. The header has all columns in order of appearance; missing values are
-    empty.
-    """
+    """The header has all columns in order of appearance; missing values are empty."""
     lines = [flat_row(row) for row in rows]
     text = io.StringIO(newline="")
     names = dict.fromkeys(name for line in lines for name in line)

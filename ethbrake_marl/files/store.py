@@ -28,7 +28,7 @@ def write_file(path: Path, data: bytes) -> None:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Path of a temporary file, which is renamed to ``path`` if the block succeeds, otherwise deleted."""
+    """It is renamed to ``path`` if the block succeeds, otherwise deleted."""
     partial = _temporary(path.parent)
     try:
         yield partial
@@ -43,9 +43,7 @@ def new_file(path: Path) -> Iterator[Path]:
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Check, before a long computation, that ``path`` can be written as a file.
-
-    Raises ``AlreadyExists`` for an existing file, unless ``force``. Raises ``InvalidInput`` if ``path`` cannot be
+    """Raises ``AlreadyExists`` for an existing file, unless ``force``. Raises ``InvalidInput`` if ``path`` cannot be
     written, or is a folder, device, pipe or symbolic link.
     """
     target = Path(path)
@@ -72,7 +70,7 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
 
 
 def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False) -> None:
-    """Check that ``path`` can be used as a folder for results. The folder is not created.
+    """The folder is not created.
 
     Raises ``InvalidInput`` if ``path`` is not a folder or cannot be written to. Raises ``AlreadyExists`` if the folder
     contains one of ``files``, unless ``force``.
@@ -97,9 +95,7 @@ def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
 
 @contextmanager
 def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Temporary folder, which is renamed to ``path`` if the block succeeds, otherwise deleted.
-
-    With ``replace`` an existing ``path`` is deleted after the block; without it, an existing ``path`` raises
+    """With ``replace`` an existing ``path`` is deleted after the block; without it, an existing ``path`` raises
     ``AlreadyExists``.
     """
     if not replace:
@@ -137,10 +133,7 @@ def remove_folder(path: Path) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete the temporary files and folders that killed processes left in ``folder``.
-
-    No other process may be writing to this folder.
-    """
+    """No other process may be writing to this folder."""
     for leftover in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
         if leftover.is_dir() and not leftover.is_symlink():
             shutil.rmtree(leftover)
@@ -150,7 +143,7 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextmanager
 def hold_lock(lock: Path, message: str) -> Iterator[None]:
-    """Hold the lock file ``lock`` during the block. The lock is also released if the process ends.
+    """The lock is also released if the process ends.
 
     Warns on a file system without locks. Raises ``InvalidInput`` with the text ``message`` if another process holds the
     lock, or if the file cannot be locked.

@@ -22,7 +22,7 @@ _NUMERAL = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
 
 def parse_numeral(text: str) -> float | None:
-    """Number in ``text`` (infinity if it is too large), or None if it is not a number."""
+    """Infinity if it is too large, None if it is not a number."""
     return float(text) if _NUMERAL.fullmatch(text) else None
 
 
@@ -34,7 +34,6 @@ _RESERVED = {"null", "true", "false"}
 def flow_text(value: Any, longest: int | None = None) -> str:
     """``value`` as YAML on one line (flow style). Parsing this text gives an equal value.
 
-    ``value`` may consist of printable texts, lists, mappings with text keys, numbers, true, false and null.
     ``longest``: largest length of the text, which is cut off for error messages; None: no limit.
     """
     text = _flow(value)
@@ -42,7 +41,7 @@ def flow_text(value: Any, longest: int | None = None) -> str:
 
 
 def _flow(value: Any) -> str:
-    """Text of ``flow_text``; values of other types become their ``repr``."""
+    """Values of other types become their ``repr``."""
     if isinstance(value, BaseModel):
         value = value.model_dump(exclude_none=True)
     if isinstance(value, dict):
@@ -88,16 +87,12 @@ _PLAIN_VALUES: tuple[tuple[re.Pattern[str], Callable[[str], Any]], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """Content of a YAML file, with the line number of each value."""
-
     file: str  # path or name of the file, for error messages
     content: Any  # dict, list, str, int, float, bool or None, nested
     lines: Mapping[YamlPath, int]  # line number (from 1) of each value
 
     def where(self, path: YamlPath) -> str:
-        """File and line of the value at ``path``, such as ``my.yaml, line 7``; for a missing value, the line of its
-        mapping.
-        """
+        """Such as ``my.yaml, line 7``; for a missing value, the line of its mapping."""
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
                 return f"{self.file}, line {self.lines[path[:length]]}"
@@ -105,7 +100,6 @@ class Document:
 
     @contextmanager
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
-        """Put the place ``where(path)`` in front of the message of an ``InvalidInput`` that the block raises."""
         try:
             yield
         except InvalidInput as error:
@@ -121,7 +115,7 @@ def read_yaml(path: str | Path) -> Document:
 
 
 def parse_yaml(text: str | bytes, file: str = "<text>") -> Document:
-    """Content of a YAML document of at most ``YAML_SIZE_LIMIT`` bytes. ``file``: name of the document in messages.
+    """At most ``YAML_SIZE_LIMIT`` bytes. ``file``: name of the document in messages.
 
     Raises ``InvalidInput`` with file, line, column and reason.
     """
@@ -139,7 +133,7 @@ def parse_yaml(text: str | bytes, file: str = "<text>") -> Document:
 
 @lru_cache(maxsize=128)
 def _parse(text: str, file: str) -> tuple[Any, Mapping[YamlPath, int]]:
-    """Content of a YAML text, and the line of each value. Both are cached (10 ms) and must not be changed."""
+    """Both are cached (10 ms) and must not be changed."""
     lines: dict[YamlPath, int] = {}
     try:
         node = yaml.compose(text, Loader=_Loader)
@@ -163,13 +157,12 @@ class _Refused(yaml.MarkedYAMLError):
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML loader that refuses aliases, anchors, tags and deep nesting."""
+    """Refuses aliases, anchors, tags and deep nesting."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  # PyYAML's own are those of YAML 1.1
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """The next node. Raises ``_Refused`` for an alias, an anchor, a tag or too deep nesting."""
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         problem = ""
         if isinstance(event, yaml.AliasEvent):
@@ -189,7 +182,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
-    """Value of a node. The line numbers of all values in the node are added to ``lines``."""
+    """Adds the line numbers of all values in the node to ``lines``."""
     lines.setdefault(path, node.start_mark.line + 1)
     if isinstance(node, yaml.ScalarNode):
         return _scalar(node)
@@ -210,7 +203,7 @@ def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
 
 
 def _scalar(node: yaml.ScalarNode) -> Any:
-    """Value of a scalar. A quoted or block scalar is always text."""
+    """A quoted or block scalar is always text."""
     if node.style is not None:
         return str(node.value)
     value = next(

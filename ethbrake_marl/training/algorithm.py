@@ -26,13 +26,12 @@ class Algorithm(ABC):
 
     @abstractmethod
     def build(self, training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
-        """New model on the CPU. Its random numbers come from the recipe's seed alone.
-
-        ``environment`` has one row for each learner in each world.
+        """Its random numbers come from the recipe's seed alone; one row of ``environment`` for each learner in each
+        world.
         """
 
     def actors(self, model: BaseAlgorithm) -> list[Any]:
-        """Policies that choose actions, one for each group of learners (``Training.groups``)."""
+        """One for each group of learners (``Training.groups``)."""
         return [model.policy]
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:

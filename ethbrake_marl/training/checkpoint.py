@@ -31,7 +31,6 @@ LARGEST_BYTES = 1 << 36
 
 
 def capture(model: BaseAlgorithm) -> dict[str, Any]:
-    """State of a model, its environment and the global random generators."""
     environment: Any = model.env
     memory: Any = getattr(model, "replay_buffer", None)
     log = model.logger
@@ -56,10 +55,7 @@ def capture(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
-    """Put the state ``saved``, which ``capture`` returned, into a new model that has a logger.
-
-    Raises errors of Python, NumPy or torch if the state does not fit the model.
-    """
+    """Raises errors of Python, NumPy or torch if the state does not fit the model."""
     environment: Any = model.env
     model._last_obs, model._last_episode_starts = environment.reset(), np.ones(environment.num_envs, np.bool_)
     new = capture(model)
@@ -90,10 +86,7 @@ def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
 
 
 def restore_types(new: Any, saved: Any) -> Any:
-    """Saved data with the types of ``new``: arrays instead of tensors, named tuples instead of plain ones.
-
-    Raises ``ValueError`` if keys or lengths differ, or the shape or type of an array.
-    """
+    """Raises ``ValueError`` if keys or lengths differ, or the shape or type of an array."""
     if isinstance(new, np.ndarray):
         array = saved.numpy().copy()
         if (array.shape, array.dtype) != (new.shape, new.dtype):
@@ -122,12 +115,11 @@ def to_tensors(tree: Any) -> Any:
 
 
 def files_in(folder: Path) -> list[Path]:
-    """Checkpoints in a folder, newest first."""
     return sorted(folder.glob("step_*.pt"), reverse=True)
 
 
 def write(folder: Path, saved: Mapping[str, Any]) -> None:
-    """Write a checkpoint; delete all but the newest two."""
+    """Deletes all but the newest two."""
     data = io.BytesIO()
     torch.save(to_tensors(dict(saved)), data)
     folder.mkdir(exist_ok=True)
@@ -137,7 +129,7 @@ def write(folder: Path, saved: Mapping[str, Any]) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read a checkpoint. Raises ``CorruptBundle`` if the file is damaged or not a checkpoint."""
+    """Raises ``CorruptBundle`` if the file is damaged or not a checkpoint."""
     with open_plain(path, LARGEST_BYTES, refusal=CorruptBundle, follow_links=False) as stream:
         try:
             damaged = zipfile.ZipFile(stream).testzip()
@@ -151,7 +143,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def newest_checkpoint(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
-    """Newest undamaged checkpoint, or None; and the errors of newer ones, which are deleted."""
+    """None if there is none; and the errors of newer ones, which are deleted."""
     reasons: list[str] = []
     for path in files_in(folder):
         try:

@@ -31,8 +31,6 @@ TEAM, SHIELDED = "trained team", "shielded team"  # names of what several learne
 
 
 class Experiment(NamedTuple):
-    """A trained policy or team, and its comparison with the baselines."""
-
     trained: TrainResult
     compared: Comparison
     measures: tuple[str, ...]  # names of the measures beside the usual ones
@@ -52,20 +50,13 @@ class Experiment(NamedTuple):
 
 
 class ReportWriter(Protocol):
-    """Writes a report about an experiment into the run's folder; extensions provide others."""
-
     measures: tuple[str, ...]  # names of the measures that it can show; those that no package has are left out
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
-        """Write the report; return the tables to print, and a text that says where the report is.
-
-        ``tell`` is called with the progress.
-        """
+        """Returns the tables to print, and a text that says where the report is."""
 
 
 class Tables:
-    """The simplest report: only the tables of the evaluation."""
-
     measures: tuple[str, ...] = ("pushed_m",)
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
@@ -91,13 +82,10 @@ def run_experiment(
     """Train, compare, and write ``results.json``, ``worlds.csv`` and a report into the run's folder.
 
     ``train_on``: scenario of the training; None: ``scenario``, in which the agents are compared. Optimising agents
-    minimise the count of harm used in training (``reward.harm_count``). Ctrl-C stops the training after the current
-    update, and the policy so far is compared; a second Ctrl-C raises ``KeyboardInterrupt``. Other arguments and errors
-    are as in ``train`` and ``evaluate``. ``on_unwritten`` is called if results or report cannot be written; None: the
-    error is raised.
+    minimise the count of harm used in training (``reward.harm_count``). ``on_unwritten`` is called if results or report
+    cannot be written; None: the error is raised. Other arguments and errors are as in ``train`` and ``evaluate``.
 
-    Returns the experiment, and the tables and text of the report. Raises ``InvalidInput`` at once for a scenario
-    without exact impacts, which shields and reports need.
+    Raises ``InvalidInput`` at once for a scenario without exact impacts, which shields and reports need.
     """
     if departures_by(scenario.physics):
         raise InvalidInput(
@@ -145,7 +133,7 @@ def run_experiment(
 def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: OnProgress) -> list[str]:
     """Names for which ``use`` raises no ``InvalidInput``. ``tell`` is called with the error of every other name.
 
-    ``what``: what is tried, for these reports, such as ``baselines``. The error of ``full_brake`` is raised.
+    The error of ``full_brake`` is raised.
     """
     usable_names = []
     for number, name in enumerate(names):

@@ -1,4 +1,4 @@
-"""Measurements during training: the current policies drive a fixed list of worlds."""
+"""The current policies drive a fixed list of worlds during training."""
 
 from __future__ import annotations
 
@@ -27,20 +27,16 @@ OBJECTIVE_METRIC = "objective"  # mean of what the learners minimise, where that
 
 
 def measure_on_list(training: Training) -> Evaluate:
-    """Function that measures policies (learner -> policy) on the recipe's fixed list, by ``drive_list``."""
     drive = drive_list(training)
     return lambda policies: drive({name: LearnedAgent(policy) for name, policy in policies.items()})
 
 
 def drive_list(training: Training) -> Callable[[Mapping[str, Agent]], dict[str, float]]:
-    """Function that lets agents (learner -> agent) drive the recipe's fixed list of worlds (key ``evaluation``).
-
-    It returns metrics, which are means over the worlds: the columns of all counts of harm
-    (``total_harm``), ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a learner's
-    objective is not the harm of the line, there is also each learner's objective (``objective_vehicle_2``), and their
-    mean ``objective``. In a mixture of lines every line has its share of the worlds, and ``relative_NAME`` is what is
-    minimised in the line NAME divided by that of full braking; ``objective`` is its mean over the worlds. A metric that
-    not every line has, such as ``objective_vehicle_5``, is left out.
+    """The function takes agents (learner -> agent). Its metrics are means over the worlds: the columns of all counts of
+    harm (``total_harm``), ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a
+    learner's objective is not the harm of the line, there is also each learner's objective (``objective_vehicle_2``),
+    and their mean ``objective``. In a mixture of lines every line has its share of the worlds, and ``relative_NAME`` is
+    what is minimised in the line NAME divided by that of full braking; ``objective`` is its mean over the worlds.
     """
     if training.scenario.lines:
         return _drive_lines(training.lines)
@@ -57,7 +53,6 @@ def drive_list(training: Training) -> Callable[[Mapping[str, Agent]], dict[str, 
 
 
 def full_braking(training: Training) -> dict[str, float]:
-    """Metrics of ``drive_list`` if all learners brake fully."""
     return drive_list(training)(dict.fromkeys(training.learners, FULL_BRAKE))
 
 
@@ -94,7 +89,7 @@ def _drive_lines(lines: Sequence[Training]) -> Callable[[Mapping[str, Agent]], d
 
 
 def metrics_of(training: Training, last: State) -> dict[str, float]:
-    """Metrics of ``measure_on_list``, from the last states of the episodes. The count that is minimised comes first."""
+    """The count that is minimised comes first."""
     reward, scenario = training.recipe.reward, training.scenario
     counts = dict.fromkeys([reward.harm_count, *last.counts])  # what is counted comes first
     metrics = {count.column: exact_mean(last.harm(count)) for count in counts}
@@ -114,5 +109,5 @@ def exact_mean(values: Floats) -> float:
 
 
 def deciding(metrics: Mapping[str, float], count: HarmCount) -> float:
-    """Metric by which a training picks its best policy: the lowest value is best. NaN if not measured."""
+    """The lowest value is best. NaN if not measured."""
     return metrics.get(OBJECTIVE_METRIC, metrics.get(count.column, np.nan))

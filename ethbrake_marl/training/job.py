@@ -22,11 +22,7 @@ MEASURED = (*(count.column for count in BUILT_IN_COUNTS), "collision_rate")
 
 @contextmanager
 def folder_of_many(folder: Path, *results: str) -> Iterator[None]:
-    """Create a folder for many trainings, and lock it during the block.
-
-    Existing files with the names ``results`` may be replaced. Raises ``InvalidInput`` if another process uses the
-    folder, or if it cannot be written to.
-    """
+    """Raises ``InvalidInput`` if another process uses the folder, or if it cannot be written to."""
     check_folder(folder, results, force=True)
     folder.mkdir(parents=True, exist_ok=True)
     with hold_lock(folder / ".lock", "another process works in this folder; wait until it ends, or end it"):
@@ -35,16 +31,15 @@ def folder_of_many(folder: Path, *results: str) -> Iterator[None]:
 
 
 class Job(NamedTuple):
-    """One of many trainings, and the folder of its run. It can be pickled."""
+    """It can be pickled."""
 
     training: Training
     folder: Path  # of the run; need not exist
     settings: tuple[str, ...] = ()  # ``KEY=VALUE``: changes of recipe and scenario files, for ``config.json``
 
     def finish(self, on_progress: OnProgress | None = None) -> bool:
-        """Start or resume the training, unless it has finished; return False if Ctrl-C stopped it.
-
-        Raises the errors of ``train``, and ``InvalidInput`` if the folder contains another training.
+        """False if Ctrl-C stopped it. Raises the errors of ``train``, and ``InvalidInput`` if the folder has another
+        training.
         """
         recipe, scenario = self.training.recipe, self.training.scenario
         if not self.folder.exists():
@@ -59,9 +54,7 @@ class Job(NamedTuple):
         return resume(self.folder, on_progress=on_progress).status == "finished"
 
     def attempt(self) -> str:
-        """Call ``finish``; return the message of its error, empty if there is none. Ctrl-C raises
-        ``KeyboardInterrupt``.
-        """
+        """``finish``; the message of its error, empty if there is none. Ctrl-C raises ``KeyboardInterrupt``."""
         try:
             if not self.finish():
                 raise KeyboardInterrupt

@@ -14,14 +14,14 @@ from ethbrake_marl.motion.layout import Bools
 
 
 class LinesVecEnv(VecEnv):
-    """The rows of the first environment, then those of the second, and so on. All observe the same features."""
+    """The rows of the first environment, then those of the second, and so on."""
 
     def __init__(self, environments: Sequence[EthBrakeVecEnv]) -> None:
         self.environments, first = environments, environments[0]
         super().__init__(sum(part.num_envs for part in environments), first.observation_space, first.action_space)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Give every environment this seed, as ``make_environment`` does, so that trainings keep their worlds."""
+        """Every environment gets this seed, so that trainings keep their worlds."""
         return [row_seed for part in self.environments for row_seed in part.seed(seed)]
 
     def reset(self) -> Observations:
@@ -38,7 +38,6 @@ class LinesVecEnv(VecEnv):
         return np.concatenate(observations), np.concatenate(rewards), np.concatenate(dones), all_infos
 
     def snapshot(self) -> list[dict[str, Any]]:
-        """Snapshot of each environment, for ``restore``."""
         return [part.snapshot() for part in self.environments]
 
     def restore(self, saved: Sequence[dict[str, Any]]) -> None:

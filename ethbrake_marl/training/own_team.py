@@ -67,7 +67,7 @@ def save_team(
 
 
 def network_of(name: str, actor: Any) -> NetworkSpec:
-    """Network of a user's actor, for its policy file. ``name``: learner. Raises ``InvalidInput`` for a wrong actor."""
+    """Raises ``InvalidInput`` for a wrong actor."""
     mean, log_std = getattr(actor, "mean", None), getattr(actor, "log_std", None)
     layers: list[Any] = list(mean) if isinstance(mean, nn.Sequential) else []
     linear, between = layers[::2], layers[1::2]

@@ -16,10 +16,7 @@ from ethbrake_marl.training.training import Training
 
 
 class Ppo(Algorithm):
-    """PPO of Stable-Baselines3, with separate networks for actor and critic."""
-
     def build(self, training: Training, environment: EthBrakeVecEnv) -> PPO:
-        """New PPO model with the recipe's settings; ``training.scheme`` decides which networks it has."""
         recipe = training.recipe
         assert isinstance(recipe, PpoRecipe)
         shape = recipe.network

@@ -165,19 +165,15 @@ class TrainingRecipe(FileModel):
 
     @property
     def rounds(self) -> int:
-        """Decisions of each learner in each world between two updates (key ``n_steps``)."""
+        """Key ``n_steps``."""
         return int(vars(self)["n_steps"])
 
     @property
     def updates_per_row(self) -> int:
-        """Updates between two rows of ``progress.csv``."""
         return 1
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Networks of a policy with this number of observed features.
-
-        An algorithm overrides this unless its actor has one action, clipped to [-1, 1].
-        """
+        """An algorithm overrides this unless its actor has one action, clipped to [-1, 1]."""
         shape = vars(self)["network"]
         return NetworkSpec(
             observation_size=observation_size,
@@ -188,7 +184,7 @@ class TrainingRecipe(FileModel):
         )
 
     def replace(self, **changes: Any) -> Self:
-        """Recipe with changed values, such as ``replace(seed=3)``. Raises the errors of ``load_recipe``."""
+        """Such as ``replace(seed=3)``. Raises the errors of ``load_recipe``."""
         content = {**self.model_dump(mode="json"), **{key: plain(value) for key, value in changes.items()}}
         changed = _check_recipe(Document(f"recipe {self.name!r}", content, {}))
         return changed  # type: ignore[return-value]  # another class only with another algorithm
@@ -271,18 +267,18 @@ class SacRecipe(TrainingRecipe):
         return self.log_every_updates
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """The actor's network; a SAC policy is saved without critics."""
+        """A SAC policy is saved without critics."""
         return super().network_spec(observation_size).model_copy(update={"value_hidden": (), "output": "tanh"})
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """Name -> file of all recipes in the package, including those of extensions."""
+    """Name -> file, also those of extensions."""
     files = sorted(shipped_folder("train").rglob("*.yaml"), key=lambda file: file.name)
     return {file.stem: file for file in files}
 
 
 def usable_recipes() -> dict[str, Path]:
-    """Name -> file of shipped recipes whose algorithm is installed."""
+    """Name -> file of recipes whose algorithm is installed."""
     return {name: file for name, file in shipped_recipes().items() if _algorithm_in(read_yaml(file)) in ALGORITHMS}
 
 
@@ -290,8 +286,7 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | TrainingRecipe) -> Trai
     """Load a recipe by its name, by the path of its file, or from a file's content.
 
     A text that ends in ``.yaml`` or contains a path separator is a path; ``~`` is the home folder. Raises
-    ``UnknownName`` for an unknown name, and ``InvalidInput`` with file, line, key, value and what would be right for
-    bad content.
+    ``UnknownName`` for an unknown name, and ``InvalidInput`` for bad content.
     """
     if isinstance(recipe, TrainingRecipe):
         return recipe
@@ -310,7 +305,7 @@ def _algorithm_in(document: Document) -> object:
 
 
 def _check_recipe(document: Document, shipped: Path | None = None) -> TrainingRecipe:
-    """Recipe in a file's content. ``shipped``: its path if it is a shipped recipe, for the error message."""
+    """``shipped``: path of a shipped recipe, for the error message."""
     name = _algorithm_in(document)
     if not isinstance(name, str) or name not in ALGORITHMS:
         right = f"must be one of {', '.join(ALGORITHMS)}"
@@ -325,7 +320,6 @@ def _check_recipe(document: Document, shipped: Path | None = None) -> TrainingRe
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Valid keys in place of the last key of ``path``, including registered terms inside ``reward``."""
         inside = super().known(path)
         return [*inside, *registered_terms()] if path[:-1] == ("reward",) else inside
 
@@ -370,6 +364,5 @@ ALGORITHMS: Registry[tuple[type[TrainingRecipe], type[Any] | str]] = Registry(
 
 
 def algorithm_of(recipe: TrainingRecipe) -> Any:
-    """New ``Algorithm`` for a recipe."""
     algorithm = ALGORITHMS[recipe.algorithm][1]
     return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()

@@ -12,7 +12,7 @@ from ethbrake_marl.training.recipe import ALGORITHMS, TrainingRecipe
 
 
 def recipe_schema() -> dict[str, Any]:
-    """JSON Schema of recipe files. The possible keys depend on ``algorithm``."""
+    """The possible keys depend on ``algorithm``."""
     classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
     places, schema = models_json_schema(
         [(recipe, "validation") for recipe in classes.values()], schema_generator=FileSchema
@@ -46,7 +46,7 @@ def recipe_schema() -> dict[str, Any]:
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Meanings of a recipe's keys, key -> text. A key without a description takes the base class's."""
+    """A key without a description takes the base class's."""
     meanings: dict[str, str] = {}
     for base in reversed(recipe.__mro__):
         for key, field in base.model_fields.items() if issubclass(base, TrainingRecipe) else ():

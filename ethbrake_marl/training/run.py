@@ -1,4 +1,4 @@
-"""The folder of a training run, and its logs. Each file is written completely or not at all."""
+"""The folder of a training run, and its logs."""
 
 from __future__ import annotations
 
@@ -25,8 +25,6 @@ RUN_FORMAT = "ethbrake-run"
 
 
 class RunFolder:
-    """Paths of the files of a training run, and access to them. The folder need not exist yet."""
-
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).expanduser()
         self.config = self.path / "config.json"  # recipe and scenario in full, seeds, versions
@@ -38,7 +36,7 @@ class RunFolder:
         self.checkpoints = self.path / "checkpoints"  # until the training has finished
 
     def create(self, config: Mapping[str, Any], *, force: bool = False) -> None:
-        """Create the folder with ``config.json`` and ``run.json``. With ``force`` it replaces an earlier run.
+        """With ``force`` it replaces an earlier run.
 
         Raises the errors of ``check_new_run``, and ``InvalidInput`` if a process is training in the earlier run.
         """
@@ -50,7 +48,7 @@ class RunFolder:
             new.write_status("running")
 
     def held(self) -> AbstractContextManager[None]:
-        """Lock the folder for this process. Entering raises ``InvalidInput`` if another process trains here."""
+        """Raises ``InvalidInput`` if another process trains here."""
         return hold_lock(self.path / "run.lock", "another process is training in this folder")
 
     def write_status(self, status: Status, **more: Any) -> None:
@@ -63,8 +61,6 @@ class RunFolder:
     def stage(self, name: str, status: Status) -> Iterator[None]:
         """Record the block in ``run.json`` as a stage after the training: its name, how it ended, and the files it
         wrote.
-
-        ``status`` is recorded if the block succeeds.
         """
         with self.held():
             self.write_status("running", stage=name)
@@ -82,10 +78,7 @@ class RunFolder:
                 self.write_status(ended, reason=reason, written=written)
 
     def training(self) -> Training:
-        """The training that this folder records.
-
-        Raises ``InvalidInput`` if this is not the folder of a run, if a file is damaged, or if a folder is a link.
-        """
+        """Raises ``InvalidInput`` if this is no folder of a run, if a file is damaged, or if a folder is a link."""
         if not (os.path.lexists(self.status) or os.path.lexists(self.config)):
             raise InvalidInput(
                 f"{self.path}: is not the folder of a run; name the folder of a run, for instance runs/my-run"
@@ -106,7 +99,6 @@ class RunFolder:
             raise InvalidInput(f"{self.config}: {error}") from None
 
     def clear(self) -> None:
-        """Delete unfinished files of killed processes, and the files that the last ``stage`` wrote."""
         for folder in (self.path, self.checkpoints):
             remove_unfinished(folder)
         written = read_object(self.status).get("written", ())
@@ -115,9 +107,7 @@ class RunFolder:
                 path.unlink()
 
     def open_logs(self, progress: str, steps: int | None) -> list[KVWriter]:
-        """Writers of ``progress.csv``, which begins with the text ``progress``, and of TensorBoard's events.
-
-        ``steps``: number of decisions so far of a training that is resumed; None for a new one, which deletes old
+        """``steps``: number of decisions so far of a training that is resumed; None for a new one, which deletes old
         events.
         """
         self.progress.unlink(missing_ok=True)  # it may be a link, whose target must not be overwritten

@@ -23,8 +23,6 @@ from ethbrake_marl.training.training import Training
 
 
 class CentralCriticPolicy(ActorCriticPolicy):
-    """PPO policy whose actor sees the first ``actor_size`` entries of an observation, and whose critic sees all."""
-
     def __init__(self, *arguments: Any, actor_size: int, **settings: Any) -> None:
         self.actor_size = actor_size  # set before ``super().__init__``, which builds the networks
         super().__init__(*arguments, **settings)
@@ -36,7 +34,7 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _CentralCriticExtractor(MlpExtractor):
-    """Hidden layers of an actor, for the first ``actor_size`` entries of an observation, and of a critic, for all."""
+    """The actor sees the first ``actor_size`` entries of an observation, the critic all."""
 
     def __init__(self, actor_size: int, critic_size: int, net_arch: Any, activation_fn: Any) -> None:
         super().__init__(actor_size, net_arch, activation_fn, device="cpu")
@@ -48,9 +46,7 @@ class _CentralCriticExtractor(MlpExtractor):
 
 
 class SeparatePolicies(BasePolicy):
-    """One policy with one optimiser for each learner, behind the interface of a single policy.
-
-    ``columns``: for each learner, the columns of an observation that it sees. ``network``: further arguments of
+    """``columns``: for each learner, the columns of an observation that it sees. ``network``: further arguments of
     Stable-Baselines3's ``ActorCriticPolicy``.
     """
 
@@ -74,7 +70,7 @@ class SeparatePolicies(BasePolicy):
 
     @property
     def log_std(self) -> Tensor:
-        """Logarithm of the exploration noise of each learner, [L]."""
+        """One for each learner, [L]."""
         return torch.cat([member.log_std for member in self.policies])
 
     @property
@@ -94,7 +90,7 @@ class SeparatePolicies(BasePolicy):
         return actions, values, likelihood
 
     def predict_values(self, observation: Any) -> Tensor:
-        """Values of the critics, [n, 1], for observations [n, F + 1], whose last column is the learner's number."""
+        """As in ``forward``."""
         values = torch.empty(len(observation), 1)
         for number, policy, rows in self._by_learner(observation):
             values[rows] = policy.predict_values(observation[rows][:, self.columns[number]])
@@ -112,8 +108,6 @@ class SeparatePolicies(BasePolicy):
 
 
 class IndependentPPO(PPO):
-    """PPO with a separate policy for each learner. Its log has columns such as ``vehicle_2/loss``."""
-
     policy: SeparatePolicies  # type: ignore[assignment]  # has the parts of an actor-critic policy that PPO uses
 
     def __init__(
@@ -124,7 +118,6 @@ class IndependentPPO(PPO):
         super().__init__(SeparatePolicies, environment, policy_kwargs=network, **settings)  # type: ignore[arg-type]
 
     def train(self) -> None:
-        """Train each learner's policy by ``PPO.train``, on this learner's part of the rollout buffer."""
         joint, buffer, log, updates = self.policy, self.rollout_buffer, self._logger, self._n_updates
         parts = [self._part(buffer, number) for number in range(len(self.names))]
         try:

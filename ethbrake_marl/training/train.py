@@ -62,12 +62,12 @@ class TrainResult:
 
     @property
     def agent(self) -> str:
-        """Name of the trained agent, such as ``policy@runs/mine``."""
+        """Such as ``policy@runs/mine``."""
         return agent_of(self.training, self.directory)
 
     @property
     def metrics(self) -> Mapping[str, float] | None:
-        """Metrics of ``policies`` on the fixed list; None if nothing was measured."""
+        """None if nothing was measured."""
         steps = next(iter(self.policies.values())).manifest.steps
         return next((evaluation for evaluation in self.evaluations if evaluation["steps"] == steps), None)
 
@@ -187,9 +187,7 @@ def _shared_policy(policies: Policies) -> Policy:
 
 @contextmanager
 def _one_training() -> Iterator[Callable[[], bool]]:
-    """Let one training at a time use the random generators, and restore them afterwards.
-
-    Inside the block, Ctrl-C only sets the flag that the yielded function returns, and torch has its usual type and
+    """Inside the block, Ctrl-C only sets the flag that the yielded function returns, and torch has its usual type and
     device and one thread: a second thread makes training 3 to 15 times slower if another process uses the cores.
     """
     if not _ONE_TRAINING.acquire(blocking=False):
@@ -215,7 +213,7 @@ def _one_training() -> Iterator[Callable[[], bool]]:
 
 
 def make_environment(training: Training) -> EthBrakeVecEnv | LinesVecEnv:
-    """Environment of a training, with one row for each learner in each world."""
+    """One row for each learner in each world."""
     environments = []
     for line in training.lines:
         recipe = line.recipe
@@ -226,7 +224,7 @@ def make_environment(training: Training) -> EthBrakeVecEnv | LinesVecEnv:
 
 
 def make_model(training: Training, environment: EthBrakeVecEnv | LinesVecEnv) -> BaseAlgorithm:
-    """New model of Stable-Baselines3, built by the recipe's algorithm. Raises ``InvalidInput`` for VecNormalize."""
+    """Raises ``InvalidInput`` for VecNormalize."""
     model: BaseAlgorithm = algorithm_of(training.recipe).build(training, environment)
     if model.get_vec_normalize_env() is not None:
         raise InvalidInput(
@@ -237,7 +235,7 @@ def make_model(training: Training, environment: EthBrakeVecEnv | LinesVecEnv) ->
 
 
 def _learn(updates: BetweenUpdates, saved: Mapping[str, Any] | None) -> TrainResult:
-    """Train to the end, or until a stop; save the policies, also after an error.
+    """Saves the policies, also after an error.
 
     ``saved``: checkpoint from which the training continues; None: begin.
     """
@@ -285,7 +283,6 @@ def _check_unfinished(folder: RunFolder, training: Training) -> None:
 
 
 def _check_same(folder: RunFolder, training: Training, saved: Mapping[str, Any], other_versions: bool) -> None:
-    """Raise ``InvalidInput`` if a checkpoint is of another training or, unless allowed, of other versions."""
     if saved["training"] != training.identity:
         raise InvalidInput(
             f"{folder.config}: this file was changed after the checkpoint of step {saved['steps']} was written; restore"

@@ -25,7 +25,7 @@ STATUS_FILE = "run.json"  # in the folder of a run
 
 
 class Training(NamedTuple):
-    """A recipe and a scenario that fit each other (``Training.of``). Equal trainings give equal policies."""
+    """``Training.of`` checks that both fit each other. Equal trainings give equal policies."""
 
     recipe: TrainingRecipe
     scenario: Scenario
@@ -35,10 +35,8 @@ class Training(NamedTuple):
 
     @classmethod
     def of(cls, recipe: Any, scenario: AnyScenario, **changes: Any) -> Training:
-        """Training for a recipe and a scenario, in any form that ``load_recipe`` and ``load_scenario`` accept.
-
-        Learners observe what the recipe lists, or else what the scenario lists. ``changes``: other values for keys of
-        the recipe. Raises ``InvalidInput`` if recipe and scenario do not fit each other.
+        """Learners observe what the recipe lists, or else what the scenario lists. ``changes``: other values for keys
+        of the recipe. Raises ``InvalidInput``.
         """
         recipe, scenario = load_recipe(recipe), load_scenario(scenario)
         recipe = recipe.replace(**changes) if changes else recipe
@@ -77,7 +75,7 @@ class Training(NamedTuple):
 
     @property
     def groups(self) -> tuple[tuple[str, ...], ...]:
-        """Groups of learners that share a policy, front to rear."""
+        """Learners that share a policy, front to rear."""
         return tuple((name,) for name in self.learners) if self.scheme == "independent" else (self.learners,)
 
     @property
@@ -90,12 +88,12 @@ class Training(NamedTuple):
 
     @property
     def row(self) -> View:
-        """Features in the environment's observations: all features that at least one learner observes."""
+        """All features that at least one learner observes."""
         return View(list(dict.fromkeys(name for view in self.views for name in view.names)))
 
     @property
     def columns(self) -> list[list[int]]:
-        """For each learner, the columns of the environment's observations (``row``) that this learner observes."""
+        """Columns of ``row`` that each learner observes."""
         place = {name: column for column, name in enumerate(self.row.names)}
         return [[place[name] for name in view.names] for view in self.views]
 
@@ -112,7 +110,7 @@ class Training(NamedTuple):
         return ", ".join(dict.fromkeys(declared[body - 1] for body in self.scenario.learners))
 
     def content(self) -> dict[str, dict[str, Any]]:
-        """Everything that affects the training, including defaults, without titles and descriptions."""
+        """With defaults, without titles and descriptions."""
         recipe = self.recipe.model_dump(mode="json", exclude=set(DESCRIPTIVE_KEYS))
         return {"recipe": recipe, "scenario": self.scenario.content(without=DESCRIPTIVE_KEYS)}
 
@@ -131,13 +129,12 @@ class Training(NamedTuple):
         }
 
     def who_drives(self) -> str:
-        """Text about which policy controls which vehicles: ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        """Such as ``scheme shared: policy drives vehicle_2, vehicle_3``."""
         parts = (f"{self.drivers[group[0]]} drives {', '.join(group)}" for group in self.groups)
         return f"scheme {self.scheme}: {'; '.join(parts)}"
 
 
 def _check(recipe: TrainingRecipe, scenario: Scenario, scheme: Scheme, learners: Sequence[str]) -> None:
-    """Raise ``InvalidInput`` unless the scheme fits the number of learners, and the algorithm supports it."""
     where = f"scenario {scenario.name!r}"
     if scenario.lines and not recipe.mixes_lines:
         mixing = [name for name, (model, _) in ALGORITHMS.usable().items() if model.mixes_lines]
@@ -164,7 +161,7 @@ def _check(recipe: TrainingRecipe, scenario: Scenario, scheme: Scheme, learners:
 
 
 def check_new_run(folder: Path, *, force: bool = False) -> bool:
-    """Check that a run can be written to ``folder``. Returns whether it replaces an earlier run, as ``force`` allows.
+    """Returns whether it replaces an earlier run, as ``force`` allows.
 
     Raises ``AlreadyExists`` if anything else is at this path, and ``InvalidInput`` for a comma or plus in the path.
     """

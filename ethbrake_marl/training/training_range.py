@@ -18,17 +18,12 @@ MOST_WORLDS = 1_000  # of the fixed list that are driven
 
 
 def with_ranges(policies: Policies, training: Training) -> Policies:
-    """The policies, each with the range of what it observes in the fixed list of the training."""
     listed = training.recipe.evaluation
     return record_ranges(policies, training.scenario, min(listed.worlds, MOST_WORLDS), listed.seed) if policies else {}
 
 
 def record_ranges(policies: Policies, scenario: AnyScenario, worlds: int, seed: int, fallback: str = "") -> Policies:
-    """The policies (learner -> policy), each with the range of what it observes in ``worlds`` worlds of ``scenario``.
-
-    Learners that share a policy share its range. In a mixture of lines, every line has the same number of worlds.
-    ``fallback``: as in ``TrainingRange``.
-    """
+    """Learners that share a policy share its range. In a mixture of lines, every line has the same number of worlds."""
     lines = load_scenario(scenario).lines or (scenario,)
     observed: dict[int, list[Observations]] = {id(policy): [] for policy in policies.values()}
     for line in lines:

@@ -36,10 +36,8 @@ class TrainingDiverged(EthBrakeError, ArithmeticError):
 
 
 class BetweenUpdates(BaseCallback):
-    """Callback for the work before the first update, between updates and at the end of a training.
-
-    ``evaluate``: function from policies to metrics; ``tell``: function called with the progress; ``stop``: whether the
-    training must stop.
+    """``evaluate``: function from policies to metrics; ``tell``: function called with the progress; ``stop``: whether
+    the training must stop.
     """
 
     model: BaseAlgorithm
@@ -69,19 +67,18 @@ class BetweenUpdates(BaseCallback):
 
     @property
     def wall_s(self) -> float:
-        """Time spent on this training (s), without breaks before ``resume``."""
+        """Without breaks before ``resume``."""
         return time.monotonic() - self.wall_start
 
     @property
     def chosen(self) -> Policies:
-        """The best policies so far, or the latest if nothing was measured."""
         return self.best or self.policies
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
-        """Call ``work``; write a checkpoint if one is due. Raises ``Stopped`` if the training must stop."""
+        """Raises ``Stopped`` if the training must stop."""
         due = bool(self.count) and self.count % self.training.recipe.checkpoint_every_updates == 0
         if self.restored:
             self.restored = due = False
@@ -104,7 +101,6 @@ class BetweenUpdates(BaseCallback):
         self.work(last=True)
 
     def work(self, *, last: bool = False) -> None:
-        """Measure, log and report, each if it is due."""
         recipe = self.training.recipe
         measured = self.evaluate is not None and (last or self.count % recipe.evaluation.every_updates == 0)
         if last or measured or self.count % recipe.updates_per_row == 0:
@@ -117,7 +113,7 @@ class BetweenUpdates(BaseCallback):
             self.report()
 
     def keep_weights(self) -> None:
-        """Copy the current weights. Raises ``TrainingDiverged`` if they are not finite."""
+        """Raises ``TrainingDiverged`` if they are not finite."""
         check_finite_model(self.model)
         self.weights = policy_weights(self.training, self.model)
         self.steps, self.updates = self.model.num_timesteps, self.count
@@ -126,7 +122,6 @@ class BetweenUpdates(BaseCallback):
         self.policies = make_policies(self.training, self.steps, self.weights)
 
     def measure(self) -> None:
-        """Measure the policies, and remember them if they are the best so far."""
         assert self.evaluate is not None
         begun = time.process_time()
         metrics = {name: float(value) for name, value in self.evaluate(self.policies).items()}
@@ -148,7 +143,6 @@ class BetweenUpdates(BaseCallback):
             self.logger.dump(step=model.num_timesteps)
 
     def report(self) -> None:
-        """Report the progress to ``tell``, if there is such a function."""
         if self.tell is None:
             return
         recipe = self.training.recipe
@@ -179,7 +173,7 @@ class BetweenUpdates(BaseCallback):
         checkpoint.write(self.folder.checkpoints, {**marks, "course": course, "model": checkpoint.capture(self.model)})
 
     def restore(self, saved: Mapping[str, Any]) -> None:
-        """Continue from a checkpoint. Raises ``CorruptBundle`` if the checkpoint does not fit this training."""
+        """Raises ``CorruptBundle`` if the checkpoint does not fit this training."""
         course = saved["course"]
         try:
             checkpoint.restore(self.model, saved["model"])
@@ -200,10 +194,7 @@ class BetweenUpdates(BaseCallback):
             ) from None
 
     def save(self, status: Status, reason: BaseException | None = None) -> None:
-        """Save the policies with their ranges, and the status; delete the checkpoints of a finished training.
-
-        After an error, ``reason``, the ranges are left out: to record them, the policies must drive.
-        """
+        """After an error, ``reason``, the ranges are left out: to record them, the policies must drive."""
         if self.weights:
             self.make_policies()
         if reason is None:
@@ -239,16 +230,13 @@ def check_finite_model(model: BaseAlgorithm) -> None:
 
 
 def policy_weights(training: Training, model: BaseAlgorithm) -> list[dict[str, Float32s]]:
-    """Copies of the policies' weights, one mapping name -> tensor for each group of learners."""
+    """One mapping name -> tensor for each group of learners."""
     algorithm = algorithm_of(training.recipe)
     return [algorithm.tensors(*pair) for pair in zip(algorithm.actors(model), training.networks, strict=True)]
 
 
 def make_policies(training: Training, steps: int, weights: Sequence[Mapping[str, Float32s]]) -> dict[str, Policy]:
-    """Policies after ``steps`` decisions, learner -> policy.
-
-    ``weights``: for each group of learners that share a policy, name of a tensor -> its entries.
-    """
+    """``weights``: for each group of learners that share a policy, name of a tensor -> its entries."""
     recipe, scenario = training.recipe, training.scenario
     policies: dict[str, Policy] = {}
     for learners, network, tensors in zip(training.groups, training.networks, weights, strict=True):

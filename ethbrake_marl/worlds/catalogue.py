@@ -38,7 +38,6 @@ class CatalogueEntry:
 
 
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
-    """Folder of the shipped scenarios or training recipes (``train``), in a source checkout or an installed package."""
     checkout = _PACKAGE.parent / folder
     return checkout if (_PACKAGE.parent / "pyproject.toml").is_file() else _PACKAGE / "_data" / folder
 
@@ -46,8 +45,7 @@ def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
 def register_scenarios(folder: str | os.PathLike[str]) -> None:
     """Register the scenario files in a folder: the file ``my-name.yaml`` becomes the scenario ``my-name``.
 
-    Files are checked only when used. Raises ``InvalidInput`` for a folder without YAML files, and ``AlreadyExists`` for
-    a name in use.
+    Raises ``InvalidInput`` for a folder without YAML files, and ``AlreadyExists`` for a name in use.
     """
     path = Path(folder).expanduser().resolve()
     files = sorted(path.glob("*.yaml"))
@@ -67,9 +65,8 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
 def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenario:
     """Load a scenario from its name, from the path of its file, or from the content of such a file.
 
-    Raises ``UnknownName`` for an unknown name. Raises ``InvalidInput`` for a bad file (with file, line, key and value).
-    If the key ``name`` differs from the file's name, warns (``IgnoredName``): the file's name counts, with ``-`` for
-    characters that no name has.
+    Raises ``UnknownName`` for an unknown name, ``InvalidInput`` for a bad file. If the key ``name`` differs from the
+    file's name, warns (``IgnoredName``): the file's name counts, with ``-`` for characters that no name has.
     """
     if isinstance(scenario, Scenario):
         return scenario
@@ -79,7 +76,7 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
 
 
 def _load(path: Path, above: tuple[Path, ...]) -> Scenario:
-    """Load the scenario file ``path``. ``above``: chain of files that need it; each of them needs the next one."""
+    """``above``: chain of files that need it; each of them needs the next one."""
     document = read_yaml(path)
     loaded = _build_scenario(document, path.parent, (*above, path))
     name = re.sub("[^a-z0-9_-]", "-", path.stem.lower()).lstrip("-_")[:64] or loaded.name
@@ -96,9 +93,9 @@ def _load(path: Path, above: tuple[Path, ...]) -> Scenario:
 def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
     """Path of a scenario's file.
 
-    A text that ends in ``.yaml`` or ``.yml`` is a path relative to ``folder``; the file need not exist. Any other text
-    is the name of a shipped or registered scenario. If there is no such scenario, the text is the path of an existing
-    file, without the ending. Raises ``UnknownName`` if there is no such file either.
+    A text that ends in ``.yaml`` or ``.yml`` is a path relative to ``folder``. Any other text is the name of a shipped
+    or registered scenario. If there is no such scenario, the text is the path of an existing file, without the ending.
+    Raises ``UnknownName`` if there is no such file either.
     """
     text, paths = str(name_or_path), scenario_paths()
     path = folder / Path(text).expanduser()
@@ -113,7 +110,6 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
 
 
 def group_of_scenarios(name: str) -> list[str]:
-    """Names of the scenarios in a group, which is a folder of shipped scenarios; [] for an unknown group."""
     return sorted(path.stem for path in shipped_folder().glob("*/*.yaml") if path.parent.name == name)
 
 
@@ -174,7 +170,7 @@ def _base(document: Document, name: Any, folder: Path, above: tuple[Path, ...]) 
 
 
 def _load_below(what: str, path: Path, above: tuple[Path, ...]) -> Scenario:
-    """Load the file ``path``, which the last file of ``above`` needs. Raises ``InvalidInput`` if it is one of them."""
+    """Load the file ``path``, which the last file of ``above`` needs; a circle raises ``InvalidInput``."""
     places = [file.resolve() for file in above]
     if path.resolve() in places:
         circle = " -> ".join(file.stem for file in (*above[places.index(path.resolve()) :], path))
@@ -185,7 +181,6 @@ def _load_below(what: str, path: Path, above: tuple[Path, ...]) -> Scenario:
 
 
 def _member(document: Document, i: int, entry: Any, folder: Path, above: tuple[Path, ...]) -> Any:
-    """Entry ``i`` of a mixture in which a scenario's name, path or ``based_on`` is replaced by the content."""
     if not isinstance(entry, dict) or "scenario" not in entry:
         return entry
     at: YamlPath = ("mixture", i, "scenario")
@@ -202,7 +197,6 @@ def _member(document: Document, i: int, entry: Any, folder: Path, above: tuple[P
 
 
 def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> Any:
-    """Content of a scenario in which the name of the table's CSV file is replaced by the rows of this file."""
     table = content.get("table") if isinstance(content, dict) else None
     if not (isinstance(table, dict) and isinstance(table.get("file"), str)) or "rows" in table:
         return content

@@ -75,7 +75,6 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     """Number k of message periods that a burst of losses lasts, for each of the uniform numbers ``u`` in [0, 1).
 
     With p = ``loss_begins`` and r = ``loss_ends``, k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``.
-    The computation needs no logarithm, so every machine gets the same k.
     """
     bound, bounds = loss_begins / (loss_begins + loss_ends), []
     while bound > 2.0**-53:
@@ -102,7 +101,7 @@ class ChannelKey:
     keys: type[ScenarioPart]  # its keys of ``v2x``, with types and descriptions; none is required
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Keys of messages (``OF_MESSAGES``) that this key needs even if ``link_latency_s`` fixes all delays."""
+        """Keys of ``OF_MESSAGES`` needed even if ``link_latency_s`` fixes all delays."""
         return ()
 
     def is_random(self, v2x: V2X) -> bool:
@@ -127,8 +126,7 @@ class ChannelKey:
 def register_v2x_key(key: str, channel_key: ChannelKey) -> None:
     """Register what a key of ``v2x`` adds to the channel. Entry points: ``ethbrake_marl.v2x_keys``.
 
-    Raises ``InvalidInput`` for an object that is not a ``ChannelKey``, for a key that is not in its ``keys``, and for a
-    ``name`` in use; ``AlreadyExists`` for a key of ``v2x`` itself.
+    Raises ``InvalidInput`` for a bad key or name; ``AlreadyExists`` for a key of ``v2x`` itself.
     """
     keys, name = getattr(channel_key, "keys", None), getattr(channel_key, "name", None)
     if name in (MARKS, "shaping", "shield"):  # memories that a game has itself
@@ -206,7 +204,6 @@ class V2X(ScenarioPart):
     @model_validator(mode="wrap")
     @classmethod
     def _with_preset(cls, value: Any, build: ModelWrapValidatorHandler[Self]) -> Self:
-        """Build the channel from a preset's name, or from a mapping in which missing keys take the preset's values."""
         if isinstance(value, V2X):
             return build(value)
         name = value.get("preset", "paper") if isinstance(value, dict) else value
@@ -234,7 +231,7 @@ class V2X(ScenarioPart):
 
     @model_serializer(mode="wrap")
     def _as_written(self, dump: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
-        """Settings that the scenario file contains. Those that only the preset sets are None or left out."""
+        """Settings that the scenario file contains."""
         with_defaults = not (info.exclude_unset or info.exclude_none)
         return {
             key: setting if key in self._keys else None
@@ -243,7 +240,6 @@ class V2X(ScenarioPart):
         }
 
     def _check(self) -> None:
-        """Refuse keys without effect, and a channel by which a vehicle may never learn anything."""
         extended = {CHANNEL_KEYS[key]: key for key in self.model_extra or ()}
         right = "belong to different channel keys, whose memories have the same name; leave one out"
         names = {channel_key.name for channel_key in extended}
@@ -256,7 +252,6 @@ class V2X(ScenarioPart):
         require(not blind, (), self, right)
 
     def without_effect(self) -> dict[str, str]:
-        """Keys that change nothing in this channel, and why."""
         used_keys = [key for channel_key in self.channel_keys for key in channel_key.uses(self)]
         unused_keys = [key for key in OF_MESSAGES if key not in used_keys]
         reasons: dict[str, str] = {}
@@ -282,30 +277,23 @@ class V2X(ScenarioPart):
 
     @property
     def channel_keys(self) -> tuple[ChannelKey, ...]:
-        """What the keys of ``v2x`` add to the channel. They are sorted by name, so the order of the keys has no
-        effect.
-        """
+        """Sorted by name, so the order of the keys has no effect."""
         channel_keys = {CHANNEL_KEYS[key] for key in self.model_extra or ()}
         return tuple(sorted(channel_keys, key=lambda channel_key: channel_key.name))
 
     @property
     def timing(self) -> Literal["latency", "fixed", "messages"]:
-        """How the time of a message is set: by the receiver's latency, by ``link_latency_s``, or by a random draw."""
         if self.link_latency_s is not None:
             return "fixed"
         return "latency" if PRESETS[self.preset].get("preset", self.preset) == "paper" else "messages"
 
     @property
     def by_link(self) -> bool:
-        """Whether single links (from one sender to one receiver) matter.
-
-        In the paper's channel they do not: a vehicle knows everything as soon as its own latency is over.
-        """
+        """Whether single links (from one sender to one receiver) matter."""
         return self.timing != "latency" or (self.hears, self.senses, self.silent_links) != ("all", "none", 0.0)
 
     @property
     def drawn(self) -> bool:
-        """Whether random numbers decide what vehicles know of each other, or from when on."""
         random_messages = self.hears != "none" and (self.timing == "messages" or 0.0 < self.silent_links < 1.0)
         random_sensing = self.senses != "none" and self.sensing_s[0] != self.sensing_s[1]
         random_keys = any(channel_key.is_random(self) for channel_key in self.channel_keys)
@@ -342,8 +330,7 @@ class V2X(ScenarioPart):
     def news(self, own_latency: Floats, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
         """Times from which each vehicle can react, [n, N] s, and from which vehicle i reacts to vehicle j, [n, N, N] s.
 
-        ``own_latency`` [n, N] (s): latencies without the wait for messages. ``u``, ``unheard``: as in
-        ``heard_and_seen``.
+        ``own_latency`` [n, N] (s): latencies without the wait for messages.
         """
         N, (message_time, sensing_delay) = own_latency.shape[1], self.heard_and_seen(u, unheard)
         latency = own_latency.copy()
@@ -355,7 +342,7 @@ class V2X(ScenarioPart):
         return latency, reaction_time
 
     def latest_reaction_s(self, own_latency: Floats, unheard: Bools) -> Floats:
-        """Latest time from which each vehicle can react, whatever is drawn, [n, N] s. Arguments as in ``news``."""
+        """Latest time from which each vehicle can react, whatever is drawn, [n, N] s."""
         n, N = own_latency.shape
         slowest = np.tile([1.0, 0.0, 0.0, 1.0], (n, N * N))  # numbers of links
         return self.news(own_latency, slowest, unheard)[0]
@@ -365,7 +352,7 @@ def register_preset(name: str, settings: Mapping[str, Any]) -> None:
     """Register a V2X channel as the preset ``name``, for ``v2x: name`` in scenarios.
 
     ``settings``: content of the key ``v2x``, such as ``{"preset": "nominal", "loss_begins": 0.1}``. Raises
-    ``AlreadyExists`` if another channel has the name, ``InvalidInput`` for a bad name or bad settings.
+    ``AlreadyExists``, ``InvalidInput``.
     """
     if not isinstance(name, str) or re.fullmatch(NAME_PATTERN, name) is None:
         raise InvalidInput(

@@ -24,7 +24,6 @@ def values_of(v2x: V2X) -> dict[str, Any]:
 
 
 def key_table(v2x: V2X | None = None) -> list[list[str]]:
-    """Header and rows of the table; with the values of a channel ``v2x``, if there is one, in the column ``here``."""
     presets = [name for name, settings in PRESETS.items() if "preset" not in settings]  # of this package
     channels = ([] if v2x is None else [v2x]) + [V2X.model_validate(name) for name in presets]
     all_values = [values_of(channel) for channel in channels]
@@ -37,7 +36,6 @@ def key_table(v2x: V2X | None = None) -> list[list[str]]:
 
 
 def page_table() -> str:
-    """The table in Markdown."""
     head, *rows = [[cell.replace("|", r"\|") for cell in row] for row in key_table()]
     rows = [[f"`{key}`", *cells] for key, *cells in rows]
     return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])

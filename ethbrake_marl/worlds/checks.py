@@ -1,4 +1,4 @@
-"""Checks of a scenario that involve several keys. Each check refuses the first mistake, with its place."""
+"""Checks of a scenario that involve several keys."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 
 def check_scenario(scenario: Scenario) -> None:
-    """Refuse a scenario (other than a mixture) whose keys contradict each other."""
     if scenario.types is not None:
         check_types(scenario.types, scenario.vehicle_types, scenario.vehicles)
     _check_declared_once(scenario)
@@ -43,7 +42,6 @@ def check_scenario(scenario: Scenario) -> None:
 
 
 def _check_declared_once(scenario: Scenario) -> None:
-    """Refuse a quantity that is declared twice, or missing, for some vehicle."""
     for key, rule in QUANTITIES.items():
         value = getattr(scenario, key)
         kinds = scenario.vehicle_types or {} if key in OF_A_TYPE else {}
@@ -68,7 +66,6 @@ def _check_declared_once(scenario: Scenario) -> None:
 
 
 def _check_channel(scenario: Scenario) -> None:
-    """Refuse times, messages and physics that contradict each other."""
     v2x = scenario.v2x
     in_time = scenario.time_step_s <= scenario.horizon_s
     right = f"must not be above horizon_s ({scenario.horizon_s:g} s)"
@@ -86,7 +83,6 @@ def _check_channel(scenario: Scenario) -> None:
 
 
 def _check_roles(scenario: Scenario) -> None:
-    """Refuse roles that ``early_impacts: reject`` forbids, and a Vehicle 1 that learns without an obstacle ahead."""
     for name, role in scenario.roles.items():
         script = role.partition(":")[0]
         hint = "".join(f"; did you mean {close}?" for close in get_close_matches(script, HOLDING_SCRIPTS, n=1))
@@ -134,7 +130,6 @@ class ScenarioWording(Wording):
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """What would be valid in place of a value that pydantic rejects; "": a general text is used."""
         value, kind = detail["input"], detail["type"]
         if kind == "quantity" or (kind == "float_type" and detail["loc"][-1] == "#number"):
             hints = [suggestion(str(key), DISTRIBUTIONS) for key in value] if isinstance(value, dict) else []

@@ -22,7 +22,7 @@ _PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
 
 def world_numbers(n: int, seed: int, first: int, purpose: str) -> Ints:
-    """Numbers ``first`` to ``first + n - 1`` of n worlds, [n]. Raises ``InvalidInput`` for a bad argument."""
+    """Raises ``InvalidInput`` for a bad argument."""
     check_whole_number("number of worlds", n, 1, MOST_AT_ONCE)
     check_whole_number("seed of the list", seed, 0)
     check_whole_number("first world", first, 0, _MOST_WORLDS)

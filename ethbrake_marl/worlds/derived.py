@@ -52,10 +52,8 @@ def world_values(
 def obstacle_gap(scenario: Scenario, values: QuantityValues, declared: Callable[[str], Floats]) -> Floats:
     """Distance from Vehicle 1 to the obstacle, [k, 1] m, in k worlds of a scenario with an obstacle.
 
-    The scenario declares this distance, or a margin: the distance that is left after full braking. With a margin the
-    distance is ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``, with speed v_1, latency tau_1 and braking capacity a_1 of
-    Vehicle 1. It is longer if brakes build up (``motion.forces.stopping_m``). ``values``: result of ``world_values``;
-    ``declared``: as there.
+    With a margin the distance is ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``, with speed v_1, latency tau_1 and braking
+    capacity a_1 of Vehicle 1. It is longer if brakes build up (``motion.forces.stopping_m``).
     """
     if "obstacle_gap_m" in scenario.sources:
         return declared("obstacle_gap_m")

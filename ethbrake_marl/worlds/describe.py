@@ -22,7 +22,6 @@ OF_RESULTS = ("agent", "knows", "world", "hidden", "scenario")  # columns of res
 
 
 def columns_of(drawn_worlds: DrawnWorlds) -> dict[str, NDArray[np.generic]]:
-    """Table of drawn worlds, column -> [n]: the number ``world``, labels, ``kinds_of`` and ``quantities_of``."""
     worlds = drawn_worlds.worlds
     kinds = {**worlds.memories.get(LABELS, {}), **kinds_of(drawn_worlds)}
     return {"world": worlds.clock[:, NUMBER].astype(np.int64), **kinds, **quantities_of(worlds, drawn_worlds.friction)}
@@ -31,9 +30,8 @@ def columns_of(drawn_worlds: DrawnWorlds) -> dict[str, NDArray[np.generic]]:
 def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str, Floats]:
     """Quantities of worlds at the alert, column -> [n], as ``worlds_from_table`` reads them.
 
-    Capacities include the limit that the road's ``friction`` [n] sets. There is a column of the friction if every world
-    has one; columns of the obstacle, the brakes' rates and the weights of harm if some world has them. The distance to
-    an obstacle is NaN in a world without one. An infinite rate becomes the largest valid number.
+    Capacities include the limit that the road's ``friction`` [n] sets. The distance to an obstacle is NaN in a world
+    without one. An infinite rate becomes the largest valid number.
     """
     values = {"gaps_m": worlds.gaps_m, "speeds_mps": worlds.speeds_mps}
     values |= {key: worlds.car[:, row, 1:] for key, row in CAR_QUANTITIES.items()}
@@ -63,10 +61,7 @@ def fixed_columns(scenario: Scenario) -> set[str]:
 
 
 def kinds_of(drawn_worlds: DrawnWorlds) -> dict[str, Texts]:
-    """Texts that describe the drawn worlds, column -> [n]: ``scenario``, ``recording``, ``vehicle_1_type`` and so on.
-
-    A column without any text is left out; ``scenario`` has texts only in a mixture.
-    """
+    """``scenario``, ``recording``, ``vehicle_1_type`` and so on, column -> [n]; without columns that have no text."""
     columns = {"scenario": drawn_worlds.scenarios, RECORDING: drawn_worlds.recordings}
     types = drawn_worlds.types.T if (drawn_worlds.types != "").any() else ()
     columns = {name: column for name, column in columns.items() if (column != "").any()}
@@ -77,7 +72,7 @@ def clusters_of(columns: Mapping[str, NDArray[Any]]) -> Texts | None:
     """Name of the cluster to which each world belongs, [n]; None if all worlds are independent.
 
     Worlds of one recording depend on each other and form a cluster. The text before the last ": " in the column
-    ``recording`` is the name of the recording. A world without a recording is a cluster by itself.
+    ``recording`` is the name of the recording.
     """
     if RECORDING not in columns:
         return None

@@ -31,10 +31,7 @@ _SHARED_KEYS = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # the mixture has them i
 
 
 def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """``content`` of a scenario file with ``changes``; a key that becomes None is left out.
-
-    A new way to declare gaps, speeds or an obstacle replaces the old one.
-    """
+    """``content`` of a scenario file with ``changes``; a key that becomes None is left out."""
     old = {key for pair in ALTERNATIVES.items() for key in pair if changes.keys() & set(pair)}
     if "speeds_mps" in changes:
         old.add("speed_deviations_mps")
@@ -45,8 +42,8 @@ def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> d
 def with_members(content: dict[str, Any], scenario: type[Scenario]) -> dict[str, Any]:
     """Content of a mixture with a ``Scenario`` object for each member, and with the values that all members share.
 
-    A key that stands next to ``mixture`` replaces this key in every member. ``scenario``: the class ``Scenario``.
-    Content with a malformed list is returned unchanged, for the schema to refuse.
+    A key that stands next to ``mixture`` replaces this key in every member. Content with a malformed list is returned
+    unchanged, for the schema to refuse.
     """
     entries = content["mixture"]
     if (
@@ -82,7 +79,6 @@ def have_different_lines(members: Sequence[Scenario]) -> bool:
 
 
 def require_one_line(scenario: Scenario) -> None:
-    """Raise ``InvalidInput`` for a mixture of lines."""
     if scenario.lines:
         names = ", ".join(member.name for member in scenario.lines)
         raise InvalidInput(
@@ -92,7 +88,6 @@ def require_one_line(scenario: Scenario) -> None:
 
 
 def _check_alike(members: Sequence[Scenario]) -> None:
-    """Refuse a member that is listed twice, and members that differ in a key that all must share."""
     first, *later_members = members
     extended = any(member.v2x.channel_keys for member in members)
     shared_keys = (*_ONE_FOR_ALL, "v2x") if extended else _ONE_FOR_ALL

@@ -34,11 +34,10 @@ def game_of(
     report: Sequence[str] = (),
     threads: int | None = None,
 ) -> tuple[Scenario, Game]:
-    """The scenario with this ``observation``, and its game. ``names.open_game`` finds scenario and scripts by name.
+    """The scenario with this ``observation``, and its game.
 
-    ``scripts``: vehicle (1: Vehicle 1) -> script, for vehicles whose role is the name of an agent. ``threads`` as in
-    ``open_game``, other arguments as in ``EthBrakeParallelEnv``. Warns (``FreeImpacts``) if an impact costs nothing
-    under a learner's objective.
+    ``scripts``: vehicle (1: Vehicle 1) -> script, for vehicles whose role is the name of an agent. Warns
+    (``FreeImpacts``) if an impact costs nothing under a learner's objective.
     """
     require_one_line(scenario)
     if observation is not None:
@@ -85,16 +84,11 @@ def _warn_of_ties(scenario: Scenario, declared: Declared) -> None:
 
 @cache
 def _warn_once(message: str) -> None:
-    """Warn, but only once for each message, because a training opens its game several times."""
     warnings.warn(message, FreeImpacts, stacklevel=2)
 
 
 def views_of(scenario: Scenario) -> tuple[View, ...]:
-    """Features that each vehicle observes, front to rear.
-
-    By default a vehicle observes itself and one neighbour on each side; if there may be an obstacle, it also observes
-    its role in the line and the obstacle.
-    """
+    """Features that each vehicle observes, front to rear."""
     usual = View(["own", "front_1", "rear_1", *(["role", "obstacle"] if scenario.has_obstacle else [])])
     observation = scenario.observation
     if not isinstance(observation, dict):

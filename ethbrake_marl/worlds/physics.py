@@ -8,7 +8,7 @@ from ethbrake_marl.registry import Registry
 
 
 def register_physics(name: str, physics: Physics) -> None:
-    """Register a kind of physics under a name. Entry points: ``ethbrake_marl.physics``."""
+    """Entry points: ``ethbrake_marl.physics``."""
     PHYSICS.add(name, physics, lambda registered: registered is physics)
 
 
@@ -16,5 +16,5 @@ PHYSICS: Registry[Physics] = Registry("physics", "physics", register_physics)
 
 
 def departures_by(physics: str | None) -> frozenset[str]:
-    """Departures from the plain game of worlds whose scenario has this key ``physics`` (``episode.departures``)."""
+    """As in ``episode.departures``."""
     return departures_of(None if physics is None else PHYSICS[physics])

@@ -41,8 +41,6 @@ RECORDING = "recording"  # column of a table with texts: the recording and the v
 
 
 class Rule(NamedTuple):
-    """Meaning, unit and range of a quantity, and the random number that draws it."""
-
     key: str
     unit: str  # a key of UNITS; "": a plain number
     per: str  # vehicle, pair or world: what has one value
@@ -71,7 +69,7 @@ class Rule(NamedTuple):
         return {**limits, "properties": dict.fromkeys(("low", "high", "with_load", *DISTRIBUTIONS), inside)}
 
     def allows(self, low: float, high: float) -> bool:
-        """Whether all values from ``low`` to ``high`` are valid; False for NaN."""
+        """False for NaN."""
         return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
 
     def check(self, quantity: Any, at: YamlPath = ()) -> None:
@@ -83,18 +81,15 @@ class Rule(NamedTuple):
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Stream (``counters.uniform_numbers``) and column of the random number that draws a value.
-
-        The value is that of the vehicle or pair ``index`` (from 0).
-        """
+        """Stream (``counters.uniform_numbers``) and column of the random number that draws a value."""
         return self.stream, NUMBERS_PER_VEHICLE * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
-        """Name of the table column for vehicle or pair ``index`` (from 0), such as ``gap_1_m``."""
+        """Such as ``gap_1_m``; ``index`` from 0."""
         return self.column.format(index + 1)
 
     def owner(self, index: int) -> str:
-        """Vehicle or pair ``index`` (from 0) in words: ``vehicle_1``, or ``vehicle_1 to vehicle_2``; "" for a world."""
+        """Such as ``vehicle_1 to vehicle_2``; "" for a world."""
         front = f"vehicle_{index + 1}"
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
 
@@ -208,7 +203,7 @@ CAR_QUANTITIES = {
 
 
 def stream_width(stream: tuple[int, ...], vehicles: int) -> int:
-    """Number of random numbers that a world takes from a ``stream`` such as ``MAIN`` (``counters.uniform_numbers``)."""
+    """Random numbers that a world takes from the stream."""
     return NUMBERS_PER_VEHICLE * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
 
 
@@ -219,8 +214,5 @@ def check_length(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
 
 
 def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, QuantityEntry]:
-    """Columns of a table with these quantities: name -> (key, index of the vehicle or pair from 0).
-
-    An example is ``{"gap_1_m": ("gaps_m", 0)}``.
-    """
+    """Columns of a table with these quantities: name -> (key, index of the vehicle or pair from 0)."""
     return {QUANTITIES[key].column_of(i): (key, i) for key in keys for i in range(QUANTITIES[key].count(vehicles))}

@@ -20,7 +20,6 @@ LEAST_MASS = 1e-6  # least probability of [low, high] before truncation; below i
 
 
 def check_order(ends: tuple[float, float]) -> tuple[float, float]:
-    """Return the ends [low, high] of a range. Refuse low above high, as an error of the pydantic model."""
     require(ends[0] <= ends[1], (), ends, "low must not be above high")
     return ends
 
@@ -40,8 +39,6 @@ def pick(weights: Sequence[float] | Floats, u: Floats) -> Ints:
 
 
 class ScenarioPart(FileModel):
-    """Part of a scenario file; a key without a value is an error."""
-
     @field_validator("*", mode="before")
     @classmethod
     def _written(cls, value: Any) -> Any:
@@ -67,7 +64,6 @@ class Uniform(Distribution):
     uniform: Ends = Field(description="[low, high]")
 
     def value(self, u: Floats) -> Floats:
-        """Values for the uniform numbers ``u``, [n]. None is above high, because u is at most 1 - 2^-53."""
         low, high = self.uniform
         return low + (high - low) * u
 
@@ -202,7 +198,6 @@ PerVehicle = Annotated[
 
 
 def support(quantity: Any) -> tuple[float, float]:
-    """Smallest and largest value of a number or distribution."""
     if isinstance(quantity, float):
         return quantity, quantity
     low, high = quantity.support
@@ -210,5 +205,4 @@ def support(quantity: Any) -> tuple[float, float]:
 
 
 def values(quantity: Any, u: Floats) -> Floats:
-    """Values of a number or distribution, [n], for uniform numbers ``u`` [n] in [0, 1)."""
     return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)

@@ -31,10 +31,7 @@ def check_vehicle(name: str, vehicles: int, at: YamlPath, value: Any) -> None:
 
 
 def check_role(role: str) -> str:
-    """Return the role. Raise ``InvalidInput`` unless it is ``name`` or ``name:argument``, with a valid argument.
-
-    A Python file is no valid name: scenarios must not run code.
-    """
+    """Raises ``InvalidInput``. A Python file is no valid name: scenarios must not run code."""
     match = _FORM.fullmatch(role)
     if match is None:
         raise InvalidInput(
@@ -58,7 +55,7 @@ def check_role(role: str) -> str:
 
 
 def deceleration_of(role: str) -> float | None:
-    """Deceleration a (m/s2; negative: drives) of a role ``constant:a``; None for any other role."""
+    """m/s2; negative: drives. None for a role other than ``constant:a``."""
     name, _, argument = role.partition(":")
     return parse_numeral(argument) if name == "constant" else None
 
@@ -72,8 +69,6 @@ def first_command(role: str, braking_capacity: Floats) -> Floats:
 
 
 class Roles(dict[str, str]):
-    """Read-only mapping vehicle -> role."""
-
     def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
         raise InvalidInput(
             "roles of a scenario cannot be changed; make a new scenario with scenario.replace(roles=...) or"
@@ -88,5 +83,5 @@ class Roles(dict[str, str]):
 
     @classmethod
     def complete(cls, roles: Mapping[str, str], vehicles: int) -> Roles:
-        """Roles of all vehicles; a vehicle that is not in ``roles`` brakes fully."""
+        """A vehicle that is not in ``roles`` brakes fully."""
         return cls({name: roles.get(name, "full_brake") for name in names_of(vehicles)})

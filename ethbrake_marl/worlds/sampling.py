@@ -48,8 +48,6 @@ Texts = NDArray[np.str_]
 
 
 class DrawnWorlds(NamedTuple):
-    """Worlds at the alert, with drawn values that their state does not contain."""
-
     worlds: State
     friction: Floats  # [n] of the road; NaN where it has none
     types: Texts  # [n, N] vehicle types; "" without
@@ -64,7 +62,7 @@ class DrawnWorlds(NamedTuple):
 
 
 class WorldPool:
-    """Worlds of a scenario for one purpose. Worlds that are drawn one after the other are drawn many at a time."""
+    """Worlds that are drawn one after the other are drawn many at a time."""
 
     def __init__(self, scenario: Scenario, purpose: Purpose) -> None:
         self.scenario, self.purpose = scenario, purpose
@@ -76,7 +74,7 @@ class WorldPool:
         return WorldPool, (self.scenario, self.purpose)  # without the worlds
 
     def __call__(self, n: int, seed: int, first: int) -> State:
-        """Worlds ``first`` to ``first + n - 1`` of the seed; their arrays are new."""
+        """The arrays are new."""
         follows, self.following = (seed, first) == self.following, (seed, first + n)
         worlds = self._stored_worlds(n, seed, first)
         if worlds is None and follows and n < self.most:
@@ -95,9 +93,7 @@ class WorldPool:
 
 
 def draw_worlds(scenario: Scenario, n: int, seed: int, first: int, purpose: Purpose) -> DrawnWorlds:
-    """Worlds ``first`` to ``first + n - 1`` of the seed's endless list.
-
-    Raises ``InvalidInput`` for bad arguments, for a mixture of lines, and for a world that has an early impact in
+    """Raises ``InvalidInput`` for bad arguments, for a mixture of lines, and for a world that has an early impact in
     ``MOST_ATTEMPTS`` draws.
     """
     require_one_line(scenario)
@@ -112,19 +108,13 @@ def draw_worlds(scenario: Scenario, n: int, seed: int, first: int, purpose: Purp
 
 
 def member_numbers(scenario: Scenario, index: Ints, seed: int, purpose: Purpose = "list") -> Ints:
-    """Number (from 0) of the mixture's member from which each world is drawn, [n].
-
-    ``index`` [n]: numbers of the worlds, in ascending order.
-    """
+    """Number (from 0) of the member from which each world is drawn, [n]. ``index`` [n] is in ascending order."""
     u = uniform_numbers(seed, purpose, 0, index)(OF_WORLD, MIXTURE)[:, 0]
     return pick([member.weight for member in scenario.mixture or ()], u)
 
 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> DrawnWorlds:
-    """The worlds ``index`` [n] of a scenario without mixture, drawn from the random ``numbers``.
-
-    A world with an early impact (``has_early_impact``) is not drawn again.
-    """
+    """A world with an early impact (``has_early_impact``) is not drawn again."""
     n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.columns.get(RECORDING)
     numbers, kind, load = cache(numbers), np.zeros((n, N), np.int64), np.zeros((n, N))
     if line is not None:
@@ -168,9 +158,7 @@ def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, l
 
 
 def state_of(scenario: Scenario, quantities: QuantityValues, numbers: Numbers, unheard: Bools, index: Ints) -> State:
-    """State at the alert of worlds whose ``quantities`` are all known.
-
-    ``index`` [n]: numbers of the worlds, or -1. ``numbers``: source of random numbers for the delays of V2X links
+    """``index`` [n]: numbers of the worlds, or -1. ``numbers``: source of random numbers for the delays of V2X links
     (``counters.uniform_numbers``). ``unheard`` [n or 1, N, N]: links that never deliver (``Scenario.unheard``).
     """
     n, N = quantities["speeds_mps"].shape
@@ -200,7 +188,6 @@ def state_of(scenario: Scenario, quantities: QuantityValues, numbers: Numbers, u
 
 
 def _draw_accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> DrawnWorlds:
-    """The worlds ``index`` [n]. If the scenario rejects early impacts, worlds with such an impact are drawn again."""
     drawn_worlds = draw_once(scenario, uniform_numbers(seed, purpose, 0, index), index)
     if scenario.early_impacts == "keep" or not scenario.learners:
         return drawn_worlds

@@ -177,7 +177,7 @@ class Scenario(ScenarioPart):
 
     @classmethod
     def from_document(cls, document: Document) -> Self:
-        """Build a scenario from a parsed file; error messages then contain file and line."""
+        """Error messages contain file and line."""
         scenario = cls.__new__(cls)
         scenario._build(document)
         return scenario
@@ -252,45 +252,37 @@ class Scenario(ScenarioPart):
         return self._pools[purpose](int(n), int(seed), int(first))
 
     def draw(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> DrawnWorlds:
-        """The worlds of ``sample``, with the friction, vehicle types, member of the mixture and recording of each.
-
-        The result also contains the number of rejected draws.
-        """
+        """The worlds of ``sample``, with values that their state does not contain."""
         return draw_worlds(self, n, seed, first, purpose)
 
     @cached_property
     def _pools(self) -> dict[Purpose, WorldPool]:
-        """Sources of the worlds of ``sample``, for each purpose."""
         return {"list": WorldPool(self, "list"), "training": WorldPool(self, "training")}
 
     # ---- who is in the line
 
     @property
     def members(self) -> tuple[Scenario, ...]:
-        """Scenarios of a mixture, each with the keys that stand next to ``mixture``; empty if this is no mixture."""
+        """Each with the keys that stand next to ``mixture``; empty if this is no mixture."""
         return tuple(entry.scenario for entry in self.mixture or ())
 
     @cached_property
     def lines(self) -> tuple[Scenario, ...]:
-        """Members of a mixture of lines; empty for every other scenario.
-
-        Such a mixture has the ``vehicles`` of its longest line; a vehicle is a learner if it learns in some line.
-        """
+        """Such a mixture has the ``vehicles`` of its longest line; a vehicle is a learner if it learns in some line."""
         return self.members if self.mixture and have_different_lines(self.members) else ()
 
     @cached_property
     def vehicle_names(self) -> tuple[str, ...]:
-        """``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
+        """Front to rear."""
         return names_of(self.vehicles)
 
     @cached_property
     def learners(self) -> tuple[int, ...]:
-        """Numbers of the vehicles that learn (1: Vehicle 1)."""
+        """1: Vehicle 1."""
         return tuple(i + 1 for i, name in enumerate(self.vehicle_names) if self.roles[name] == LEARNER)
 
     @property
     def has_obstacle(self) -> bool:
-        """Whether some worlds have an obstacle ahead of Vehicle 1."""
         declares_obstacle = not {"obstacle_gap_m", "obstacle_margin_m"}.isdisjoint(self.sources)
         return declares_obstacle or any(member.has_obstacle for member in self.members)
 
@@ -308,12 +300,10 @@ class Scenario(ScenarioPart):
 
     @cached_property
     def types_of_line(self) -> TypesOfLine | None:
-        """Vehicle types that are possible at each place of the line; None if the scenario has no types."""
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
     @property
     def columns(self) -> dict[str, TableColumn]:
-        """Columns of the scenario's table by name, including ``recording``."""
         return {} if self.table is None else self.table.by_name
 
     @cached_property
@@ -322,7 +312,7 @@ class Scenario(ScenarioPart):
         a single entry for a quantity of the whole world.
 
         An entry maps each possible vehicle type, by number (0 without types), to a constant, a distribution or a column
-        of the table. ``sources["mass_t"]`` may be ``[{0: 2.0, 1: 9.5}, ...]``.
+        of the table.
         """
         sources = {}
         for key, rule in QUANTITIES.items():
@@ -341,9 +331,7 @@ class Scenario(ScenarioPart):
         return sources
 
     def bounds(self, key: str) -> tuple[tuple[float, float], ...]:
-        """Smallest and largest value of a quantity, for each vehicle or pair, or once for the world.
-
-        Capacities include the limit that the road's friction sets. An undeclared rate of the brakes counts as the
+        """Capacities include the limit that the road's friction sets. An undeclared rate of the brakes counts as the
         largest valid rate.
         """
         require_one_line(self)
@@ -353,29 +341,24 @@ class Scenario(ScenarioPart):
         return tuple(zip(lows.tolist(), highs.tolist(), strict=True))
 
     def ends(self, key: str) -> Floats:
-        """Smallest and largest value of a declared quantity, [2, entries].
-
-        There is one entry for each vehicle or pair, or one for the world.
-        """
+        """Smallest and largest value of a declared quantity, [2, entries]."""
         supports = [np.array([support(quantity) for quantity in entry.values()]) for entry in self.sources[key]]
         return np.array([(ends[:, 0].min(), ends[:, 1].max()) for ends in supports]).T
 
     # ---- its content, and scenarios like it
 
     def declared(self) -> dict[str, Any]:
-        """The declared keys as plain data: ``Scenario(**scenario.declared())`` equals the scenario."""
+        """``Scenario(**scenario.declared())`` equals the scenario."""
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
     def content(self, without: Sequence[str] = ()) -> dict[str, Any]:
-        """All values as plain data, with defaults, but without the keys ``without`` and the titles of a mixture's
-        members.
-        """
+        """With defaults, without the titles of a mixture's members."""
         without_words: dict[str, Any] = {"mixture": {"__all__": {"scenario": {*DESCRIPTIVE_KEYS}}}}
         derived = ("vehicles", "roles") if self.lines else ()
         return self.model_dump(mode="json", exclude=without_words | dict.fromkeys((*without, *derived), True))
 
     def replace(self, **changes: Any) -> Scenario:
-        """The scenario with changed values, such as ``replace(mass_t=2.0)``; in a mixture every member changes.
+        """Such as ``replace(mass_t=2.0)``; in a mixture every member changes.
 
         A new way to declare gaps, speeds or an obstacle (``time_gaps_s``) replaces the old one (``gaps_m``). A key that
         becomes None returns to its default.
@@ -383,9 +366,8 @@ class Scenario(ScenarioPart):
         return Scenario(**changed_content(self.declared(), changes))
 
     def with_learners(self, learners: Iterable[str]) -> Scenario:
-        """The scenario with exactly these learners, such as ``["vehicle_2"]``. Former learners brake fully.
-
-        Raises ``InvalidInput`` for an unknown vehicle, and in a mixture of lines.
+        """The scenario with exactly these learners, such as ``["vehicle_2"]``. Former learners brake fully. Raises
+        ``InvalidInput``.
         """
         require_one_line(self)
         if isinstance(learners, str) or not isinstance(learners, Iterable):
@@ -395,10 +377,7 @@ class Scenario(ScenarioPart):
 
 
 def plain(value: Any) -> Any:
-    """``value`` as plain dictionaries, lists, numbers and texts.
-
-    ``value`` may be a mapping, sequence, array, pydantic model, ``View``, path or enumeration.
-    """
+    """``value`` as plain dictionaries, lists, numbers and texts."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_unset=True, exclude_none=True)
     if isinstance(value, View):

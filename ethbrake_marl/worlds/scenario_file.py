@@ -59,7 +59,6 @@ def check_file_name(kind: str, name: str) -> None:
 
 
 def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path = Path()) -> str:
-    """Text of a new scenario file in ``folder``, based on ``based_on``. Comments list the values of that scenario."""
     check_file_name("scenario", name)
     base = load_scenario(based_on)
     values, path = base.declared(), scenario_path(based_on)
@@ -79,10 +78,7 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path
 
 
 def whole_text(scenario: str | Path) -> str:
-    """Text of a scenario's file. If the scenario is based on another one: a text with all values of the scenario.
-
-    Comments at the end show all keys of ``v2x``, if the scenario has it.
-    """
+    """Text of a scenario's file. If the scenario is based on another one: a text with all values of the scenario."""
     path, loaded = scenario_path(scenario), load_scenario(scenario)
     text = read_plain(path, YAML_SIZE_LIMIT).decode("utf-8")
     declared, has_channel = loaded.declared(), "v2x" in loaded.model_fields_set and not loaded.members
@@ -102,7 +98,6 @@ def _channel_comment(v2x: V2X) -> str:
 
 
 def scenario_json_schema() -> dict[str, Any]:
-    """JSON Schema of scenario files, with the range of every quantity."""
     schema = Scenario.model_json_schema(schema_generator=FileSchema)
     for properties in (schema["properties"], schema["$defs"]["VehicleType"]["properties"]):
         for key in properties.keys() & QUANTITIES.keys():

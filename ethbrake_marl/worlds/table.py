@@ -66,7 +66,6 @@ class Table(ScenarioPart):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        """Refuse keys that contradict each other, and rows whose length is not the number of columns."""
         require(not (self.file and self.rows), ("file",), self.file, "cannot be combined with rows; leave one out")
         read = "must be given as lists here; only load_scenario reads the rows from a file"
         require(self.rows is not None, ("rows",), UNSHOWN, read)
@@ -78,10 +77,7 @@ class Table(ScenarioPart):
         return self
 
     def check_cells(self, known: Mapping[str, QuantityEntry]) -> None:
-        """Refuse unknown columns, numbers outside the range of their quantity, and unprintable texts.
-
-        ``known``: possible columns of numbers, name -> (key, index from 0).
-        """
+        """``known``: possible columns of numbers, name -> (key, index from 0)."""
         hint = f"known: {', '.join((*known, RECORDING))}"
         for c, name in enumerate(self.columns):
             unknown = f"unknown column; {suggestion(name, known) or hint}"
@@ -102,15 +98,13 @@ class Table(ScenarioPart):
 
 
 class CsvFile(NamedTuple):
-    """A CSV file with a header and at least one row. Its cells are unchecked texts."""
-
     path: Path
     header: list[str]
     rows: dict[int, list[str]]  # line on which a row begins -> its cells
 
     @classmethod
     def read(cls, path: Path) -> CsvFile:
-        """CSV file at ``path``, without blank lines. Raises ``InvalidInput`` if the file is not CSV or has no rows."""
+        """Raises ``InvalidInput`` if the file is not CSV or has no rows."""
         rows, line = dict[int, list[str]](), 1
         data = read_plain(path, CSV_SIZE_LIMIT)
         try:
@@ -133,10 +127,7 @@ class CsvFile(NamedTuple):
         return cls(path, header, rows)
 
     def cells(self, columns: Sequence[str], texts_in: Collection[str] = (RECORDING,)) -> list[list[float | str]]:
-        """Cells of ``columns``, row by row: numbers, but texts in the columns ``texts_in``.
-
-        Raises ``InvalidInput`` for a row of another length than the header, and for a text that is not a number.
-        """
+        """Cells of ``columns``, row by row: numbers, but texts in the columns ``texts_in``. Raises ``InvalidInput``."""
         cells: list[list[Any]] = []
         for line, row in self.rows.items():
             if len(row) != len(self.header):
@@ -152,7 +143,7 @@ class CsvFile(NamedTuple):
 
 
 def read_rows(path: Path, columns: object) -> list[list[float | str]]:
-    """Cells of ``columns`` of a CSV file, row by row. ``columns``: the value of this key in a scenario's ``table``.
+    """``columns``: the value of this key in a scenario's ``table``.
 
     Ranges are not checked. Raises ``InvalidInput`` for a column that is missing or occurs twice.
     """

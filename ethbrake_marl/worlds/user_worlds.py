@@ -30,8 +30,7 @@ from ethbrake_marl.worlds.table import CsvFile
 def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> State:
     """One world from ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; a single number is for all vehicles.
 
-    A missing key takes the scenario's value, which must be fixed. Raises ``InvalidInput``, with key and index, for a
-    bad value.
+    A missing key takes the scenario's value, which must be fixed. Raises ``InvalidInput``, with key and index.
     """
     where = "initial_state"
     if not isinstance(initial_state, Mapping):
@@ -90,7 +89,7 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
 
 
 def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
-    """Worlds from a CSV file with commas and the columns of ``worlds_from_table``. Errors name file, line, column."""
+    """Worlds from a CSV file with commas and the columns of ``worlds_from_table``."""
     if not isinstance(path, str | PathLike):
         raise InvalidInput(
             f"path: type {type(path).__name__}: must be the path of a CSV file; worlds_from_table reads a table"
@@ -105,7 +104,6 @@ def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
 
 
 def world_keys(scenario: Scenario) -> tuple[str, ...]:
-    """Keys of the quantities that worlds of this scenario have, such as ``gaps_m``."""
     special_cases = {"obstacle_gap_m": scenario.has_obstacle}
     return USUAL + tuple(key for key in OPTIONAL if special_cases.get(key, key in scenario.sources))
 
@@ -121,7 +119,7 @@ def _check_known(what: str, name: str, known: Sequence[str]) -> None:
 
 
 def _entries(header: Sequence[str], scenario: Scenario, where: str) -> dict[str, QuantityEntry]:
-    """Entry of each column of a quantity, name -> (key, index); the other columns of ``header`` are labels."""
+    """Name -> (key, index); the other columns of ``header`` are labels."""
     possible_columns, of_all_scenarios = world_columns(scenario), table_columns(USUAL + OPTIONAL, scenario.vehicles)
     for name in header:
         if header.count(name) > 1:
@@ -205,13 +203,12 @@ def _worlds(
 
 
 def _short_text(value: Any) -> str:
-    """Text of a value for a message; for an array or a column only its type."""
     kind = getattr(value, "dtype", getattr(value, "type", None))
     return f"{value!r:.60}" if kind is None else f"{type(value).__name__} of {kind}"
 
 
 def _numbers(what: str, value: Any) -> Floats:
-    """Array of numbers, NaN where one is missing. Refuses booleans, masks and texts, which numpy would convert."""
+    """NaN where one is missing. Refuses booleans, masks and texts, which numpy would convert."""
     try:
         cells = np.asarray(value)
         if cells.dtype.kind == "O":
@@ -227,7 +224,7 @@ def _numbers(what: str, value: Any) -> Floats:
 
 
 def _number(cell: Any) -> float:
-    """One object as a number; NaN for a missing number, which may be None or the ``NAType`` of pandas."""
+    """NaN for a missing number, which may be None or the ``NAType`` of pandas."""
     if _is_missing(cell):
         return math.nan
     if isinstance(cell, bool) or not isinstance(cell, Real | Decimal):

@@ -46,7 +46,7 @@ class WithLoad(ScenarioPart):
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """Quantity for each ``load`` [n] (0 empty, 1 full), [n]. Uniform numbers ``u`` [n] draw the spread."""
+        """``load`` [n]: 0 empty, 1 full. Uniform numbers ``u`` [n] draw the spread."""
         empty, full = self.with_load
         value_for_load = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
         return value_for_load if self.spread == 0.0 else value_for_load + values(self.spread, u)
@@ -119,7 +119,6 @@ Types = Annotated[
 
 
 def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: int) -> None:
-    """Refuse a list of ``types`` with a wrong length, or with a type that ``vehicle_types`` does not declare."""
     right = "can be used only with the key vehicle_types, which declares the types"
     require(kinds is not None, ("types",), types, right)
     check_length(types, vehicles, "vehicle", ("types",))
@@ -132,7 +131,7 @@ def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: i
 
 
 class TypesOfLine:
-    """Possible vehicle types at each place of a line, numbered from 0 in the order of ``vehicle_types``."""
+    """Types are numbered from 0 in the order of ``vehicle_types``."""
 
     def __init__(self, kinds: Mapping[str, VehicleType], types: Any, vehicles: int) -> None:
         self.names, self.kinds = tuple(kinds), tuple(kinds.values())
@@ -155,7 +154,7 @@ class TypesOfLine:
         return types, load
 
     def unheard(self, types: Ints | None) -> Bools:
-        """Links that the vehicles' V2X equipment excludes, as in ``Scenario.unheard``."""
+        """As in ``Scenario.unheard``."""
         equipment = [kind.v2x or Equipage() for kind in self.kinds]
         silent = np.array([not equipage.sends for equipage in equipment])
         hears = np.array([("all", "front", "none").index(equipage.hears) for equipage in equipment])

@@ -104,7 +104,6 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         return TensorDict(content, batch_size=self.batch_size)
 
     def _step(self, tensordict: Any) -> Any:
-        """Advance all worlds by one step; return observations, state, rewards, and whether episodes have ended."""
         shape = self.batch_size[0], len(self.learners)
         actions = checked_actions(tensordict[GROUP, "action"].numpy(), shape, "the learners", self.actions)
         state, step = self.game.step(self.episode, actions)
@@ -151,11 +150,10 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     @property
     def scenario(self) -> Scenario:
-        """Scenario of the task: ``config["scenario"]``, which may also be a name or the path of a file."""
         return load_scenario(self.config["scenario"])
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
-        """Function that creates a ``LineEnv``. ``device`` is unused.
+        """``device`` is unused.
 
         Raises ``InvalidInput`` if ``continuous_actions`` contradicts ``actions`` in the task's ``config``.
         """

@@ -66,7 +66,7 @@ class EstimatedShield(StepShield):
         return applied, memory._replace(members=memory.members._replace(median=after))
 
     def possible_states(self, state: State, memory: StepShieldMemory) -> State:
-        """The median lines, in place of the true states, with the agents' memories in ``state``."""
+        """The median lines."""
         median: State = memory.members.median
         agent_memories = {body: state.memories[body] for body in self.drivers if body in state.memories}
         return median._replace(memories={**median.memories, **agent_memories})

@@ -57,7 +57,7 @@ class RobustShield(StepShield):
         self.uncertainty = parse_uncertainty(uncertainty)
 
     def begin(self, game: Game, alert: State, state: State) -> StepShieldMemory:
-        """Memory at the first decision. Raises ``InvalidInput`` if the intervals do not fit the worlds."""
+        """Raises ``InvalidInput`` if the intervals do not fit the worlds."""
         states = reset_without_shield(game, self.uncertainty.members(alert))
         if (states.time_s >= game.settings.horizon_s).any():
             raise InvalidInput(
@@ -81,7 +81,6 @@ class RobustShield(StepShield):
         return np.asarray(super().price(game, states, plans.repeat(M, axis=0), limits).reshape(-1, M).max(axis=1))
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        """Candidate plans of the step shield, and the constant plan that is best in the worst case."""
         learners, n, plans = game.settings.learners, state.n, super().plans(game, alert, state, states)
         if states.n == n:
             return plans
@@ -106,7 +105,6 @@ class RobustShield(StepShield):
 
 
 def reset_without_shield(game: Game, alerts: State) -> State:
-    """First decisions of the worlds ``alerts``, without shield and reward shaping."""
     return game._replace(shield=None, rewarding=game.rewarding._replace(shaping=None)).reset(alerts)
 
 

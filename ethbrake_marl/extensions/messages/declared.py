@@ -66,8 +66,6 @@ class MessageKeys(ScenarioPart):
 
 
 class Messages(ChannelKey):
-    """What the keys ``persistence`` and ``tells`` add to the channel."""
-
     name, keys = "messages", MessageKeys
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
@@ -87,7 +85,6 @@ class Messages(ChannelKey):
         return _is_periodic(v2x) and v2x.loss_begins > 0.0
 
     def check(self, scenario: Scenario) -> None:
-        """Raise an error for contents of unknown vehicles, and if a message is under way for too many time steps."""
         v2x, tells = scenario.v2x, _value(scenario.v2x, "tells")
         for name in tells if isinstance(tells, Mapping) else ():
             right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
@@ -100,11 +97,7 @@ class Messages(ChannelKey):
         require(count <= MOST_SAMPLES, ("v2x",), v2x, right)
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> MessageMemory:
-        """Memory of the message channel for n worlds at the alert.
-
-        ``numbers`` draws random numbers. ``unheard`` [n or 1, N, N]: whether vehicle i never receives messages of
-        vehicle j.
-        """
+        """``unheard`` [n or 1, N, N]: whether vehicle i never receives messages of vehicle j."""
         N, v2x = scenario.vehicles, scenario.v2x
         heard_s, seen_s = v2x.heard_and_seen(numbers(PER_LINK * N * N, NEWS), unheard)
         channel: Floats = np.zeros((n, CHANNEL_COLUMNS))

@@ -49,7 +49,7 @@ NEEDS = {  # feature of a neighbour -> pieces without which it reads 0
 
 
 class MessagesLayer(Layer):
-    """Lets a vehicle see only what it knows and estimates, according to the ``MessageMemory`` in the state."""
+    """According to the ``MessageMemory`` in the state."""
 
     stage = 1
 
@@ -151,7 +151,7 @@ class Believer(LayeredScript):
         return super().begin(alert, body)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Commands of the script, [n] m/s2, and its new memory.
+        """Commands, [n] m/s2, and the new memory.
 
         Raises ``InvalidInput`` if a command is not finite because the script needs a quantity that messages do not
         contain.

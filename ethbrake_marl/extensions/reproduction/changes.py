@@ -26,7 +26,7 @@ EARLY_S = 0.2  # time at which Vehicle 2 acts, at which the row of Non-E comes o
 
 
 def reproduce_changes(settings: ReproductionSettings) -> Made:
-    """Table of claims that differ, and of the one change that makes each true. People write both; numbers are ours."""
+    """People write claims and changes; numbers are ours."""
     episodes = settings.episodes
     readings = STATED, STATED._replace(acts_s=EARLY_S)
     stated, early = (strategies(reading, episodes, SHIPPED_SPECS) for reading in readings)

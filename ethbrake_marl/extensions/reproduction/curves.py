@@ -52,7 +52,7 @@ EXPECTED, PROVEN, ALONE = "E-V2X-BM, predicted", "least harm, proven", "PPO, not
 
 
 def harm_of_strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Floats]:
-    """First-impact harm of each strategy under one interpretation (``reading``) of the paper: name -> [n] m2/s2.
+    """First-impact harm, name -> [n] m2/s2.
 
     ``policies``: name -> agent name. Also contains the harm that E-V2X-BM predicts and, for exact impacts, the proven
     lower bound.
@@ -63,19 +63,15 @@ def harm_of_strategies(reading: Reading, episodes: int, policies: Mapping[str, s
 
 
 def process_lines(reading: Reading, episodes: int, settings: ReproductionSettings) -> dict[str, Floats]:
-    """First-impact harm (m2/s2) in the paper's fixed-step map, with policies trained as in the paper: name -> array.
-
-    The array is [seeds, n] for a trained policy and [n] for other strategies. Empty if there are no such trainings.
-    """
+    """[seeds, n] for a trained policy and [n] for other strategies, in m2/s2. Empty if there are no such trainings."""
     outcomes = process_outcomes(reading, episodes, settings)
     trained = {name: np.stack([seed[name]["first"] for seed in seeds]) for name, seeds in outcomes.items()}
     return {**harm_of_strategies(reading._replace(step_s=MAP_STEP_S), episodes, {}), **trained} if outcomes else {}
 
 
 def mean_harm(line: Floats, rows: Floats) -> Estimate:
-    """Mean of the harm ``line`` over the worlds ``rows`` (mask, [n]), with a 95 % interval.
-
-    If ``line`` is [n], the interval is over worlds; if it is [training seeds, n], over the seeds.
+    """``rows``: mask [n]. If ``line`` is [n], the interval is over worlds; if it is [training seeds, n], over the
+    seeds.
     """
     return mean(line[rows]) if line.ndim == 1 else mean(line[:, rows].mean(axis=1))
 
@@ -93,10 +89,8 @@ def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
 
 
 def show_harm(stem: str, title: str, readings: Mapping[str, Groups], legend: Sequence[str], x_label: str) -> Made:
-    """Figure of mean harm, and tables: one panel and one table for each reading (interpretation of the paper's text).
-
-    ``readings``: name -> group of worlds -> harm of each strategy, and mask of the group's worlds. ``legend``:
-    strategies in the figure. ``stem``: name of the figure's file without its ending.
+    """``readings``: name -> group of worlds -> harm of each strategy, and mask of the group's worlds. ``legend``:
+    strategies in the figure.
     """
     estimates = {
         reading: {
@@ -139,7 +133,7 @@ def distances(settings: ReproductionSettings, policies: Mapping[str, str]) -> di
 
 
 def reproduce_distance(settings: ReproductionSettings) -> Made:
-    """Fig. 4: harm of each strategy over the sum of both gaps at the alert, and the paper's statements about it."""
+    """Fig. 4."""
     readings = distances(settings, SHIPPED_SPECS)
     groups = readings["as stated"]
     stated, nearest = (statements(lines) | statements(lines, EXPECTED) for lines in readings.values())
@@ -156,7 +150,7 @@ def reproduce_distance(settings: ReproductionSettings) -> Made:
 
 
 def statements(groups: Groups, baseline: str = E_V2X_BM) -> dict[str, list[Less]]:
-    """Statements that compare strategies with E-V2X-BM, by the harm that it does or predicts (``baseline``)."""
+    """``baseline``: harm of E-V2X-BM, done or predicted."""
     shortest, *_, longest = (lines[baseline][rows] for lines, rows in groups.values())
     return {
         f"{NON_E} harms most, {baseline}": [
@@ -173,7 +167,7 @@ def statements(groups: Groups, baseline: str = E_V2X_BM) -> dict[str, list[Less]
 
 
 def constant_claim(groups: Groups) -> Claim:
-    """Verdict: at the shortest distance even the best constant deceleration does more harm than learned braking."""
+    """At the shortest distance even the best constant deceleration does more harm than learned braking."""
     (distance, (lines, rows)), *_ = groups.items()
     harm = {name: lines[name][rows] for name in (E_V2X_BM, COUPLED, *SHIPPED_SPECS, PROVEN)}
     parts = [Less.of_worlds(f"{name} minus {COUPLED}", harm[name], harm[COUPLED]) for name in SHIPPED_SPECS]
@@ -184,7 +178,7 @@ def constant_claim(groups: Groups) -> Claim:
 
 
 def advantage_claim(groups: Groups) -> Claim:
-    """Verdict: policies gain more over E-V2X-BM at the shortest distance than at the longest."""
+    """Policies gain more over E-V2X-BM at the shortest distance than at the longest."""
     gains = {
         policy: [lines[policy][rows] - lines[E_V2X_BM][rows] for lines, rows in groups.values()]
         for policy in SHIPPED_SPECS
@@ -216,7 +210,7 @@ def capacity_claim(reading: Reading, episodes: int) -> Claim:
 
 
 def avoidance_by_distance(groups: Groups, policy: str) -> Claim:
-    """Verdict: at the distance at which a policy gains most, it avoids more collisions of E-V2X-BM than it adds."""
+    """At the distance at which a policy gains most, it avoids more collisions of E-V2X-BM than it adds."""
     collided = {
         distance: [lines[name][rows] > 0.0 for name in (policy, E_V2X_BM)] for distance, (lines, rows) in groups.items()
     }
@@ -228,7 +222,7 @@ def avoidance_by_distance(groups: Groups, policy: str) -> Claim:
 
 
 def process_claims(settings: ReproductionSettings, groups: Groups, rivals: Sequence[str]) -> list[Claim]:
-    """Verdict for each algorithm of the paper's process: it does less harm than ``rivals`` in each group of worlds."""
+    """Each algorithm does less harm than ``rivals`` in each group of worlds."""
     claims = []
     for policy, course in courses_of(settings, RANDOM).items():
         parts = [
@@ -254,7 +248,7 @@ PAPER_WORLD = (("gaps_m", (7.0, 7.0)), ("speeds_mps", (20.0, 18.0, 20.0)))  # th
 
 
 def reproduce_delays(settings: ReproductionSettings) -> Made:
-    """Fig. 5: harm of each strategy at three delays, which are our choice, in the one world of the paper's figure."""
+    """Fig. 5: at three delays, which are our choice, in the one world of the paper's figure."""
     groups, trained, only_world = {}, {}, np.array([True])
     for delay in DELAYS:
         reading = STATED._replace(base=f"paper-delay-{delay}", others=PAPER_WORLD)
@@ -279,7 +273,7 @@ def reproduce_delays(settings: ReproductionSettings) -> Made:
 
 
 def robustness_claim(groups: Groups) -> Claim:
-    """Verdict: from the low to the high delay, the harm of a policy grows less than that of other strategies."""
+    """From the low to the high delay, the harm of a policy grows less than that of other strategies."""
     (low, _), *_, (high, _) = groups.values()
     growth = {name: high[name] - low[name] for name in (NON_E, E_V2X_BM, COUPLED, *SHIPPED_SPECS)}
     parts = [
@@ -291,10 +285,7 @@ def robustness_claim(groups: Groups) -> Claim:
 
 
 def room_claim(settings: ReproductionSettings) -> Claim:
-    """Harm that is certain from the start, at a low and a high delay.
-
-    The verdict is always "undecided": at the high delay the room for learning is less as a share, and more in m2/s2.
-    """
+    """Always "undecided": at the high delay the room for learning is less as a share, and more in m2/s2."""
     episodes, shares = min(ROOM_WORLDS, settings.episodes), []
     for delay in ("low", "high"):
         reading = STATED._replace(base=f"paper-delay-{delay}")
@@ -305,7 +296,7 @@ def room_claim(settings: ReproductionSettings) -> Claim:
 
 
 def time_claim(settings: ReproductionSettings) -> Claim:
-    """Verdict: the later Vehicle 2 acts, the more harm is certain, if Vehicle 3 always brakes at the same time."""
+    """The later Vehicle 2 acts, the more harm is certain, if Vehicle 3 always brakes at the same time."""
     episodes = min(ROOM_WORLDS, settings.episodes)
     least = {f"{acts_s:g} s": proven_least_harm(STATED._replace(acts_s=acts_s), episodes) for acts_s in ACTS_S}
     parts = [Less.of_worlds(f"{early} minus {late}", least[early], least[late]) for early, late in pairwise(least)]
@@ -314,10 +305,7 @@ def time_claim(settings: ReproductionSettings) -> Claim:
 
 
 def reproduce_illustration(settings: ReproductionSettings) -> Made:
-    """Fig. 8: harm over the sum of both gaps at the alert, and verdict on the hybrid.
-
-    The verdict says in how many worlds the hybrid does not pick the strategy of lower harm.
-    """
+    """Fig. 8. The verdict says in how many worlds the hybrid does not pick the strategy of lower harm."""
     readings = distances(settings, {ALONE: unconverged_policy(settings.folder)})
     hybrid = f"Hybrid {ALONE}"
     stated, nearest = (next(iter(groups.values()))[0] for groups in readings.values())

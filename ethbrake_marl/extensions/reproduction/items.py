@@ -1,7 +1,4 @@
-"""Reproduce the paper's figures and tables, and write them to a folder.
-
-The first item shows which change makes a claim true, the last one is the register of what the paper leaves open.
-"""
+"""Reproduce the paper's figures and tables, and write them to a folder."""
 
 from __future__ import annotations
 
@@ -129,11 +126,8 @@ def cost(settings: ReproductionSettings, items: Sequence[Item]) -> str:
 def reproduce(
     settings: ReproductionSettings, items: Sequence[Item], machine: str, *, force: bool = False
 ) -> dict[Item, Made] | None:
-    """Results of each item, or None if Ctrl-C stopped a training.
-
-    Trains policies that the folder of ``settings`` lacks, and writes figures, tables and a page to it. ``machine``:
-    description of the computer, for the page. Raises ``AlreadyExists`` if the folder has results and ``force`` is
-    false, and ``InvalidInput`` if a training there is not as planned.
+    """``machine``: description of the computer, for the page. Raises ``AlreadyExists`` if the folder has results and
+    ``force`` is false, and ``InvalidInput`` if a training there is not as planned.
     """
     folder, results = settings.folder, {}
     check_folder(folder, (RESULTS_FILE,), force=force)
@@ -161,7 +155,7 @@ def command_line(settings: ReproductionSettings, items: Sequence[Item]) -> str:
 
 
 def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[DrawnFigure] = ()) -> None:
-    """Write figures as SVG and PDF, and tables as CSV, to the folder ``place``. Replace existing files."""
+    """SVG, PDF and CSV. Replaces existing files."""
     if figures or sheets:
         place.mkdir(parents=True, exist_ok=True)
     for picture in figures:
@@ -173,7 +167,7 @@ def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[DrawnFigu
 
 
 def markdown(sheet: Sheet) -> str:
-    """Table without sections as Markdown, without its title and note."""
+    """Without title and note."""
     rule = ["---" if column.text else "---:" for column in sheet.formats]
     rows = [
         [cell.in_words.replace("|", "\\|") for cell in row if not isinstance(cell, str)]
@@ -204,7 +198,7 @@ def overview(results: Mapping[Item, Made]) -> Sheet:
 
 
 def page(made_by: str, results: Mapping[Item, Made], settings: ReproductionSettings) -> str:
-    """Page of all results as Markdown. ``made_by``: command, date, computer and versions."""
+    """``made_by``: command, date, computer and versions."""
     lead = f"Numbers, statements and figures of the paper *How to Brake?*, and ours. Made by {made_by}."
     parts = ["# The paper, reproduced", lead, *([] if settings.full else [QUICK_NOTE])]
     table = ["## The paper, sentence by sentence", paper_texts()["lead"], markdown(overview(results))]

@@ -68,10 +68,7 @@ def is_finished(run: Path) -> bool:
 
 
 def trained_runs(folder: Path, group: str) -> dict[TrainingPlan, list[Path]]:
-    """Finished trainings of a group, such as ``RANDOM``, in ``folder``: plan -> one folder of a run for each seed.
-
-    A plan without one is left out.
-    """
+    """Plan -> one folder of a run for each seed, without plans that have no training."""
     trained = {plan: [*filter(is_finished, runs_of(folder, group, plan))] for plan in TRAINING_GROUPS[group]}
     return {plan: runs for plan, runs in trained.items() if runs}
 
@@ -82,7 +79,7 @@ def seconds_left(folder: Path, groups: Iterable[str]) -> float:
 
 
 def train_groups(settings: ReproductionSettings, groups: Iterable[str]) -> bool:
-    """Start or continue the unfinished trainings of groups such as ``RANDOM``. Return False if Ctrl-C stopped one.
+    """False if Ctrl-C stopped one.
 
     Raises ``MissingExtra`` if torch is not installed, and the errors of ``eb.train`` and ``eb.resume``.
     """
@@ -95,7 +92,7 @@ def train_groups(settings: ReproductionSettings, groups: Iterable[str]) -> bool:
 
 
 def _train(plan: TrainingPlan, run: Path, seed: int, settings: ReproductionSettings) -> bool:
-    """Start or continue the training of one seed in the folder ``run``. Return False if Ctrl-C stopped it."""
+    """False if Ctrl-C stopped it."""
     import ethbrake_marl as eb
 
     if (run / STATUS).is_file():
@@ -119,10 +116,7 @@ def planned_training(plan: TrainingPlan, seed: int) -> Training:
 
 
 def check_trainings(folder: Path) -> None:
-    """Raise ``InvalidInput`` if a training in ``folder`` has another scenario or recipe than its plan.
-
-    It may be of an earlier version.
-    """
+    """Raise ``InvalidInput`` if a training in ``folder`` has another scenario or recipe than its plan."""
     plans = [(group, plan) for group in TRAINING_GROUPS for plan in TRAINING_GROUPS[group]]
     seeds = [(plan, seed, run) for group, plan in plans for seed, run in enumerate(runs_of(folder, group, plan))]
     for plan, seed, run in seeds:
@@ -151,10 +145,7 @@ def unconverged_policy(folder: Path) -> str:
 
 
 def process(settings: ReproductionSettings) -> dict[str, list[str]]:
-    """Agent names of policies of the group ``RANDOM``: ``PPO`` and ``SAC`` -> one agent name for each seed.
-
-    An algorithm without a training is left out.
-    """
+    """``PPO`` and ``SAC`` -> one agent name for each seed."""
     trained = trained_runs(settings.folder, RANDOM)
     return {NAMES[plan.recipe]: [f"policy@{run / 'policy'}" for run in runs] for plan, runs in trained.items()}
 
@@ -179,27 +170,27 @@ class Course(NamedTuple):
 
     @property
     def values(self) -> Floats:
-        """Mean return of training episodes at k points of the training, [seeds, k]."""
+        """At k points of the training, [seeds, k]."""
         return np.array([[*curve.values()] for curve in self.returns])
 
     @property
     def late(self) -> Floats:
-        """The ``values`` in the last quarter of the training, [seeds, at least 2]."""
+        """The last quarter of ``values``, [seeds, at least 2]."""
         return self.values[:, -max(self.values.shape[1] // 4, 2) :]
 
     @property
     def last(self) -> Floats:
-        """Mean return over the last tenth of the training, [seeds]."""
+        """Mean over the last tenth of the training, [seeds]."""
         return np.asarray(self.values[:, -max(self.values.shape[1] // 10, 1) :].mean(axis=1))
 
     @property
     def rise(self) -> Floats:
-        """Increase of the return from its first value to ``last``, [seeds]."""
+        """From the first value to ``last``, [seeds]."""
         return np.asarray(self.last - self.values[:, 0])
 
     @property
     def improvement(self) -> float:
-        """Return in the last third of the training minus that in the middle third, mean over seeds."""
+        """Last third of the training minus middle third, mean over seeds."""
         third = self.values.shape[1] // 3
         return float((self.values[:, -third:] - self.values[:, -2 * third : -third]).mean())
 
@@ -214,12 +205,10 @@ class Course(NamedTuple):
 
     @property
     def has_interval(self) -> bool:
-        """Whether seeds show chance: at least two are trained."""
         return len(self.returns) > 1
 
     @property
     def length(self) -> str:
-        """Number of seeds, length of a training and its convergence, in words."""
         return (
             f"{len(self.returns)} of {self.planned_seeds} seeds, {self.decisions:,.0f} decisions,"
             f" {self.seconds:,.0f} CPU-s, last third {self.improvement:+.2f} of a rise of {self.rise.mean():.1f}"
@@ -237,17 +226,17 @@ class Course(NamedTuple):
 
     @property
     def last_harm(self) -> Floats:
-        """Harm of the last policy, [seeds] m2/s2."""
+        """[seeds] m2/s2."""
         return np.array([curve[100.0] for curve in self.harm])
 
     @property
     def unrest(self) -> Floats:
-        """Standard deviation of the return over the last quarter of the training, [seeds]."""
+        """Standard deviation of the return over the last quarter, [seeds]."""
         return np.asarray(self.late.std(axis=1, ddof=1))
 
     @property
     def spread(self) -> Floats:
-        """Mean distance of a seed's return from the mean of all seeds, in the last quarter of the training, [seeds]."""
+        """Mean distance from the mean of all seeds, in the last quarter of the training, [seeds]."""
         return np.asarray(np.abs(self.late - self.late.mean(axis=0)).mean(axis=1))
 
 
@@ -257,10 +246,7 @@ def column(run: Path, name: str) -> dict[float, float]:
 
 
 def course_of(runs: Sequence[Path], planned_seeds: int) -> Course:
-    """Learning curves of finished ``runs``, at the steps that all runs have.
-
-    Raises ``InvalidInput`` if the runs share fewer than three steps with a return, or none with a harm.
-    """
+    """Raises ``InvalidInput`` if the runs share fewer than three steps with a return, or none with a harm."""
     curves = [[column(run, name) for run in runs] for name in (RETURN, HARM)]
     seconds = [read_object(run / STATUS)["evaluations"][-1]["cpu_s"] for run in runs]
     steps = [sorted(set.intersection(*map(set, of_seeds))) for of_seeds in curves]
@@ -285,11 +271,8 @@ def courses_of(settings: ReproductionSettings, group: str) -> dict[str, Course]:
 def judge_trained(
     name: str, courses: Mapping[str, Course], parts: Sequence[Less], *, numbers: str = "", choice_decides: bool = False
 ) -> Claim:
-    """Claim with our verdict on a statement about policies that are trained by the paper's process.
-
-    The verdict is "not converged" unless all trainings have converged, and "undecided" if one of several planned seeds
-    is trained, or if only our choice of trainings decides (``choice_decides``). ``courses``: the algorithms that the
-    statement is about. ``parts``, ``numbers``: as in ``judge``.
+    """The verdict is "not converged" unless all trainings have converged, and "undecided" if one of several planned
+    seeds is trained, or if only our choice of trainings decides (``choice_decides``).
     """
     claim = judge(name, parts, numbers=numbers)
     lengths = "; ".join(f"{algorithm}: {course.length}" for algorithm, course in courses.items())
@@ -301,10 +284,7 @@ def judge_trained(
 
 
 def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
-    """Fig. 2 or 3: learning curves at a high or low ``delay``, and the paper's statements about them.
-
-    All statements but those about the terminal reward need trainings of PPO and SAC at both delays.
-    """
+    """Fig. 2 or 3. All statements but those about the terminal reward need PPO and SAC at both delays."""
     courses = {level: courses_of(settings, level) for level in (HIGH, LOW)}
     delay_courses, claims = courses[delay], list[Claim]()
     if not delay_courses:
@@ -335,7 +315,6 @@ def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
 
 
 def claims_at_high_delay(high: Mapping[str, Course]) -> list[Claim]:
-    """Verdicts on the paper's statements about the learning curves at the high delay. ``high``: algorithm -> curves."""
     apart = np.abs(high["PPO"].last - high["SAC"].last) - ALIKE * high["PPO"].rise
     suits = [
         Less.of_lists("PPO minus SAC, deviation in the last quarter", high["PPO"].unrest, high["SAC"].unrest),
@@ -354,10 +333,8 @@ def steadiness(name: str, course: Course) -> Less:
 
 
 def claims_at_low_delay(high: Mapping[str, Course], low: Mapping[str, Course]) -> list[Claim]:
-    """Verdicts on the paper's statements about the learning curves at the low delay.
-
-    ``high``, ``low``: at a high and a low delay, algorithm -> curves. That SAC converges faster is at best "undecided":
-    the paper's axis is the progress (%) of trainings, and the paper does not state their lengths.
+    """That SAC converges faster is at best "undecided": the paper's axis is the progress (%) of trainings, and the
+    paper does not state their lengths.
     """
     ppo, sac = low["PPO"], low["SAC"]
     pairs = {name: {f"{name}, {HIGH}": high[name], f"{name}, {LOW}": low[name]} for name in low}
@@ -384,10 +361,7 @@ def claims_at_low_delay(high: Mapping[str, Course], low: Mapping[str, Course]) -
 
 
 def reward_claims(sparse: Course, dense: Mapping[str, Course]) -> list[Claim]:
-    """Verdicts on what the terminal reward does at the low delay: PPO trained with it (``sparse``) and without it.
-
-    Empty if there is no training without it.
-    """
+    """Empty if there is no training without the terminal reward."""
     if not dense:
         return []
     (course,) = dense.values()

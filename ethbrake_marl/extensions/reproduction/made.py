@@ -34,8 +34,6 @@ class DrawnFigure(NamedTuple):
 
 
 class Made(NamedTuple):
-    """Results of an item."""
-
     claims: Sequence[Claim] = ()  # claims of the paper with our verdicts
     sheets: Sequence[Sheet] = ()  # tables
     figures: Sequence[DrawnFigure] = ()

@@ -35,7 +35,7 @@ VEHICLES = np.array([1, 3])  # bodies around Vehicle 2
 
 @cache
 def collides_in_map(reading: Reading, episodes: int) -> Bools:
-    """Worlds of ``reading``, in the paper's map with its time step, in which every strategy has an impact, [n]."""
+    """[n]: every strategy has an impact."""
     from scipy.optimize import Bounds, LinearConstraint, milp  # imported here, because it takes a second to load
     from scipy.sparse import csr_matrix
 

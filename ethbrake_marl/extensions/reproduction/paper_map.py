@@ -93,7 +93,7 @@ def exchange(line: Floats, car: Floats) -> None:
 
 
 def sample(state: State, step_s: float) -> State:
-    """State after one time step: first impacts, then motion under the commands ``state.wanted`` [n, N + 1] (m/s2)."""
+    """First impacts, then motion under the commands ``state.wanted`` [n, N + 1] (m/s2)."""
     line, clock = state.line.copy(), state.clock.copy()
     exchange(line, state.car)
     now, speed, limit = clock[:, TIME, np.newaxis], line[:, SPEED], state.car[:, LIMIT]
@@ -114,9 +114,8 @@ def sample(state: State, step_s: float) -> State:
 def paper_collision(params: RewardParams, before: State, step: Step, after: State) -> Floats:
     """The paper's reward r_collision, [n]: minus ``k_energy w^2`` for every pair that overlaps as the time step begins.
 
-    w is the closing speed in ``before``, that is, before the impacts at this instant; ``step`` and ``after`` are
-    unused. A pair counts in every step that begins with its overlap, even while it separates, because the paper's
-    collision indicator Gamma depends only on the gap.
+    w is the closing speed in ``before``. A pair counts in every step that begins with its overlap, even while it
+    separates, because the paper's collision indicator Gamma depends only on the gap.
     """
     speed, gap = before.line[:, SPEED], before.line[:, GAP]
     closing = np.diff(speed[:, 1:], axis=1)
@@ -126,20 +125,17 @@ def paper_collision(params: RewardParams, before: State, step: Step, after: Stat
 
 
 class PaperMap:
-    """The paper's fixed-step map as the physics of a game (``episode.game.Physics``)."""
-
     departures = frozenset({MAP})
 
     def check(self, scenario: Scenario) -> None:
-        """Raise an error for a scenario that has an obstacle, or brakes that build up."""
+        """Refuses an obstacle, and brakes that build up."""
         right = "is not known to physics: paper-map; leave one of the two out"
         for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
             require(key not in scenario.sources, (key,), UNSHOWN, right)
 
     def rewarding(self, game: Game) -> Rewarding:
-        """Rewards of the game, with the paper's r_collision as the term ``collision``.
-
-        Raises ``InvalidInput`` for the honest cost, push, driving and motion at the horizon, which need exact impacts.
+        """Raises ``InvalidInput`` for the honest cost, push, driving and motion at the horizon, which need exact
+        impacts.
         """
         counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
         count = game.settings.harm_count
@@ -156,10 +152,7 @@ class PaperMap:
         return game.rewarding._replace(terms=terms)
 
     def first_decision(self, game: Game, alert: State) -> State:
-        """State of each episode at its first decision. ``alert``: worlds at the alert.
-
-        Raises ``InvalidInput`` if a world has an impact before its first decision, or departs from the plain game.
-        """
+        """Raises ``InvalidInput`` if a world has an impact before, or departs from the plain game."""
         require_covered(alert, "physics: paper-map", {MAP, BACKWARD})
         state = one_step.first_decision(alert, game.deciders, game.settings)
         if state.collided.any():
@@ -170,7 +163,7 @@ class PaperMap:
         return state
 
     def follow(self, game: Game, state: State, actions: Floats | None) -> tuple[State, Step]:
-        """State after one time step, and harm, rewards and ends of the step. Episodes that have ended do not change.
+        """Episodes that have ended do not change.
 
         ``actions``: of the L learners, [n, L] in [-1, 1].
         """
@@ -194,10 +187,7 @@ class PaperMap:
 
 
 def with_commands(game: Game, state: State, actions: Floats | None) -> State:
-    """State with the commands that scripts and learners choose at the beginning of a time step.
-
-    ``actions``: of the L learners, [n, L]. Raises ``InvalidInput`` unless all are in [-1, 1].
-    """
+    """``actions``: of the L learners, [n, L]. Raises ``InvalidInput`` unless all are in [-1, 1]."""
     learners = game.settings.learners
     proposals = proposal_array(learners, actions, state.n)
     if np.isnan(proposals).any():

@@ -1,9 +1,8 @@
 """The paper's random test (``Table:Random``): collision rate and mean harm of its four strategies.
 
 A *reading* is one interpretation of the paper's text: a value for each quantity that the text leaves open
-(``readings``). Readings that share the values on which a simulation depends are simulated once. H* is the harm
-of E-V2X-BM. The paper's *hybrid* follows a policy in the worlds in which the policy's harm is at most H*, and E-V2X-BM
-in all others.
+(``readings``). H* is the harm of E-V2X-BM. The paper's *hybrid* follows a policy in the worlds in which the policy's
+harm is at most H*, and E-V2X-BM in all others.
 """
 
 from __future__ import annotations
@@ -65,14 +64,11 @@ def outcome_of(last: State) -> RandomOutcome:
 
 
 def avoided_text(policy: Bools, baseline: Bools) -> str:
-    """In how many worlds a policy avoids a collision of the baseline, and adds one. Both: collided, [n]."""
     return f"avoids {(baseline & ~policy).sum():,}, adds {(policy & ~baseline).sum():,} of {len(policy):,}"
 
 
 def table_of(reading: Reading, episodes: int) -> RandomTable:
-    """The paper's table of the random test under one interpretation (``reading``) of its text, with 95 % intervals.
-
-    Raises ``InvalidInput`` if the reading needs E-V2X-BM (coupled), which needs exact impacts, in the paper's
+    """Raises ``InvalidInput`` if the reading needs E-V2X-BM (coupled), which needs exact impacts, in the paper's
     fixed-step map.
     """
     specs = "", "", SHIPPED_SPECS["SAC"], SHIPPED_SPECS["PPO"]
@@ -81,10 +77,7 @@ def table_of(reading: Reading, episodes: int) -> RandomTable:
 
 
 def report_outcome(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
-    """Collisions and harm (m2/s2), [n] each, as reported under one interpretation (``reading``) of the paper's text.
-
-    ``row``: strategy (a row of the table). ``spec``: name of the agent that is the policy of a hybrid.
-    """
+    """Collisions and harm (m2/s2), [n] each. ``spec``: name of the agent that is the policy of a hybrid."""
     worlds, counted = reading.only(*WORLD_FIELDS), reading.counted
     if row == NON_E:
         braking = brake(worlds, None, reading.after_impact, episodes)
@@ -104,21 +97,17 @@ def report_outcome(row: str, reading: Reading, episodes: int, spec: str = "") ->
 
 
 def algorithm_1(policy: RandomOutcome, baseline: RandomOutcome, bound: Floats, counted: str = "first") -> RandomOutcome:
-    """Outcome of the paper's hybrid, which in each world follows either the policy or E-V2X-BM.
-
-    It follows the policy where the policy's harm is at most ``bound``. ``policy``, ``baseline``: outcomes of the policy
-    and of E-V2X-BM. ``bound``: harm of E-V2X-BM, predicted or simulated, [n] m2/s2. ``counted``: the harm to compare,
-    ``first`` or ``total``.
+    """The hybrid follows the policy where the policy's harm is at most ``bound``. ``policy``, ``baseline``: outcomes of
+    the policy and of E-V2X-BM. ``bound``: harm of E-V2X-BM, predicted or simulated, [n] m2/s2. ``counted``: the harm to
+    compare, ``first`` or ``total``.
     """
     follows = policy[counted] <= bound
     return {key: np.where(follows, policy[key], baseline[key]) for key in policy}
 
 
 def reported_values(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
-    """Collisions and harm (m2/s2) to report, [n] each: as simulated, or as predicted at the alert.
-
-    ``numbers``: ``realised`` (simulated), ``predicted``, or ``predicted harm, realised collisions``. ``collided``,
-    ``harm``: simulated. ``predicted``: predicted harm.
+    """Collisions and harm (m2/s2), [n] each. ``numbers``: ``realised`` (simulated), ``predicted``, or ``predicted harm,
+    realised collisions``. ``predicted``: predicted harm.
     """
     if numbers == "predicted":
         return predicted > 0.0, predicted
@@ -133,9 +122,7 @@ def open_reading(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]
 
 @cache
 def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: int) -> RandomOutcome:
-    """Outcome if all vehicles brake fully or, with ``plans``, Vehicle 2 holds the deceleration that E-V2X-BM plans.
-
-    ``worlds``, ``plans``: readings (interpretations of the paper's text) that define the simulated worlds, and the
+    """``worlds``, ``plans``: readings (interpretations of the paper's text) that define the simulated worlds, and the
     worlds for which E-V2X-BM plans. ``after_impact``: the vehicles of an impact brake on (``brakes on``) or coast from
     the next decision on (``coasts``), or the episode ends (``ends``).
     """
@@ -161,9 +148,8 @@ def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: i
 def plan(plans: Reading, episodes: int) -> ConstantDeceleration:
     """Deceleration of Vehicle 2 that E-V2X-BM chooses ([n] m/s2), and the harm that it predicts ([n] m2/s2).
 
-    Both follow from the paper's closed form, without restitution and time steps. ``plans``: reading that defines the
-    worlds. If several decelerations have the least harm, ``plans.star`` selects the smallest, the middle or the
-    largest.
+    Both follow from the paper's closed form, without restitution and time steps. If several decelerations have the
+    least harm, ``plans.star`` selects the smallest, the middle or the largest.
     """
     latencies = () if plans.plans_as_stated else ("acts_s", "rear_s")
     _, _, alert = open_reading(plans.only("base", "others", "seed", *latencies), episodes)
@@ -183,12 +169,7 @@ def plan(plans: Reading, episodes: int) -> ConstantDeceleration:
 
 @cache
 def drive_all(worlds: Reading, spec: str, counted: str, episodes: int) -> RandomOutcome:
-    """Outcome if the agent ``spec`` drives Vehicle 2 in the worlds of one interpretation of the paper's text
-    (``worlds``).
-
-    ``counted``: harm that the agent minimises, ``first`` or ``total``. The warning that a policy was trained for other
-    worlds is suppressed.
-    """
+    """``counted``: harm that the agent minimises, ``first`` or ``total``."""
     scenario, game, alert = open_reading(worlds, episodes)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Unfamiliar)

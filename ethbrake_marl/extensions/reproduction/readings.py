@@ -38,7 +38,7 @@ def field_text(field: str, value: Any) -> str:
 
 
 class Reading(NamedTuple):
-    """One interpretation of the paper's text: a value for each quantity that it leaves open. Defaults are ours."""
+    """Defaults are ours."""
 
     base: str = RANDOM  # name of the scenario, of three vehicles
     acts_s: float | None = None  # when Vehicle 2 acts (s since the alert); None: the latency of the scenario
@@ -61,11 +61,10 @@ class Reading(NamedTuple):
         return "; ".join(field_text(field, getattr(self, field)) for field in changed) or "as stated"
 
     def only(self, *fields: str) -> Reading:
-        """Copy of the reading that keeps the values of ``fields``; all other fields have their defaults."""
+        """All other fields have their defaults."""
         return Reading(**{field: getattr(self, field) for field in fields})
 
     def scenario(self, name: str) -> Scenario:
-        """Shipped scenario ``name`` with this reading's latencies, physics, restitution and other keys."""
         scenario = load_scenario(name)
         keys = dict(self.others)
         latency_s = [*scenario.model_dump()["latency_s"]]

@@ -21,8 +21,6 @@ PRINTED = np.array([(row.collision_rate, row.average_harm) for row in RANDOM_TES
 
 
 class Gap(NamedTuple):
-    """A gap in the paper's text: a quantity that it does not state, or not clearly."""
-
     name: str
     paper: str  # what it says, with the label in its source
     ours: str  # our default
@@ -96,15 +94,12 @@ COMBINED = Gap("several at once", "", "", (
 
 
 def rates_and_harms(table: RandomTable) -> Floats:
-    """Collision rate and mean harm (m2/s2) of the table's four strategies, [4, 2].
-
-    The other numbers that the paper prints follow from these.
-    """
+    """Collision rates and mean harms (m2/s2) of the four strategies, [4, 2]."""
     return np.array([[number.value for number in row] for row in table.values()])
 
 
 def distance(numbers: Floats, printed: Floats = PRINTED) -> float:
-    """Distance of our table from the printed one: root mean square of ``numbers / printed - 1``, both [4, 2]."""
+    """Root mean square of ``numbers / printed - 1``, both [4, 2]."""
     return float(np.sqrt(np.square(numbers / printed - 1.0).mean()))
 
 

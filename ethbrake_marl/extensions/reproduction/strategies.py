@@ -35,11 +35,11 @@ MAP_STEP_S = 0.1
 
 
 def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, RandomOutcome]:
-    """Outcome of each strategy under one interpretation (``reading``) of the paper's text: name -> outcome.
+    """Outcome by name.
 
-    ``policies``: name -> agent name. Every policy also has a hybrid (``algorithm_1``), which compares first-impact
-    harm. If impacts are exact, E-V2X-BM (coupled) and its hybrids are included. Outcomes of E-V2X-BM and of hybrids
-    also have the predicted harm (``PREDICTED``).
+    Every policy also has a hybrid (``algorithm_1``), which compares first-impact harm. If impacts are exact, E-V2X-BM
+    (coupled) and its hybrids are included. Outcomes of E-V2X-BM and of hybrids also have the predicted harm
+    (``PREDICTED``).
     """
     worlds, plans = reading.only(*WORLD_FIELDS), reading.only(*PLANS)
     baseline = {**brake(worlds, plans, "brakes on", episodes), PREDICTED: plan(plans, episodes).harm}
@@ -58,17 +58,14 @@ def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> 
 
 
 def above_bound(hybrid: RandomOutcome) -> int:
-    """Number of worlds in which a hybrid does more harm than its H* and its policy's harm foretell."""
     return int(np.count_nonzero(hybrid["first"] > hybrid[PREDICTED] + ROUNDING))
 
 
 def process_outcomes(
     reading: Reading, episodes: int, settings: ReproductionSettings
 ) -> dict[str, list[dict[str, RandomOutcome]]]:
-    """Outcomes in the paper's fixed-step map with policies trained as in the paper.
-
-    Policy -> for each seed, strategy -> outcome. The strategies are those of ``strategies`` with this one policy. Empty
-    if there are no such trainings.
+    """Policy -> for each seed, strategy -> outcome. The strategies are those of ``strategies`` with this one policy.
+    Empty if there are no such trainings.
     """
     mapped = reading._replace(step_s=MAP_STEP_S)
     return {

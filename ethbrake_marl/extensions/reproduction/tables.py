@@ -73,7 +73,7 @@ def table_estimate(quantity: str, row: tuple[Bools, Floats], braking: tuple[Bool
 
 
 def reported_as(agent: str, quantity: str) -> str:
-    """What the nearest reading reports as a quantity of a row of the paper, in words."""
+    """In words."""
     if agent == E_V2X_BM:
         return " (what happens)" if quantity == RATE else " (predicted)"
     return " (policy alone)" if agent.startswith("Hybrid") else ""
@@ -88,11 +88,10 @@ def number_claims(
 ) -> list[Claim]:
     """Verdict on every number that the paper prints in a table.
 
-    ``stated``, ``nearest``: our outcomes with the paper's parameters as stated, and under the interpretation of the
-    paper whose results come nearest to the printed ones. ``least``: proven lower bound on the harm with the parameters
-    as stated and exact impacts, [n] m2/s2. ``in_map``: least collision rates in the paper's map, by time step. A number
-    "cannot be" if the bounds for exact impacts and for each time step of the map are above it; no bound on harm holds
-    in the map. A row of a policy that has not converged is "undecided", unless the bounds decide it.
+    ``least``: proven lower bound on the harm with the parameters as stated and exact impacts, [n] m2/s2. ``in_map``:
+    least collision rates in the paper's map, by time step. A number "cannot be" if the bounds for exact impacts and for
+    each time step of the map are above it; no bound on harm holds in the map. A row of a policy that has not converged
+    is "undecided", unless the bounds decide it.
     """
     claims, exact = [], {RATE: rate(least > 0.0), AVERAGE: mean(least)}
     bounds = exact[RATE], *in_map.values()
@@ -137,10 +136,7 @@ def least_rates_in_map(episodes: int, least: Floats) -> dict[str, Estimate]:
 
 
 def outcomes_sheet(title: str, outcomes: Mapping[str, RandomOutcome], least: Floats) -> Sheet:
-    """Table of collision rate and mean harm of each strategy, and of the proven lower bound.
-
-    ``outcomes``: strategy -> outcome. ``least``: proven lower bound on the harm, [n] m2/s2.
-    """
+    """``outcomes``: strategy -> outcome. ``least``: proven lower bound on the harm, [n] m2/s2."""
     rows = [
         (
             *(name, rate(outcome["collided"]), mean(outcome["first"]), mean(outcome["total"])),
@@ -156,10 +152,7 @@ TABLE_COLUMNS = PERCENT, *map(Column, ("First-impact harm", "Total harm", "Predi
 
 
 def process_sheet(settings: ReproductionSettings) -> list[Sheet]:
-    """Table of policies trained as in the paper, in its fixed-step map: means over seeds, with t intervals.
-
-    The list has this table, or is empty if there are no such trainings.
-    """
+    """Table of policies trained as in the paper, in its fixed-step map: means over seeds, with t intervals."""
     outcomes = process_outcomes(STATED, settings.episodes, settings)
     if not outcomes:
         return []
@@ -195,7 +188,7 @@ def compare_collisions(outcomes: Mapping[str, RandomOutcome], smaller: str, *lar
 def compare_over_seeds(seeds: Sequence[Mapping[str, RandomOutcome]], smaller: str, larger: str) -> list[Less]:
     """Comparisons of harm and collision rate between two strategies, over seeds of a policy trained as in the paper.
 
-    ``seeds``: for each seed, strategy -> outcome. ``smaller``, ``larger``: names of the two strategies.
+    ``seeds``: for each seed, strategy -> outcome.
     """
     return [
         Less(
@@ -207,10 +200,7 @@ def compare_over_seeds(seeds: Sequence[Mapping[str, RandomOutcome]], smaller: st
 
 
 def conclusions(outcomes: Mapping[str, RandomOutcome]) -> dict[str, list[Less]]:
-    """The paper's conclusions from its table: name -> comparisons that must all hold.
-
-    ``outcomes``: strategy -> outcome.
-    """
+    """The paper's conclusions from its table: name -> comparisons that must all hold."""
     hybrids = [f"Hybrid {name}" for name in SHIPPED_SPECS]
     baselines = [name for name in (E_V2X_BM, COUPLED) if name in outcomes]
     return {
@@ -248,10 +238,7 @@ def avoidance_claim(policy: str, stated: Mapping[str, RandomOutcome], nearest: M
 
 
 def world_claims(outcomes: Mapping[str, RandomOutcome], least: Floats) -> list[Claim]:
-    """Verdicts on what the paper says of single worlds, with the parameters as stated.
-
-    ``outcomes``: strategy -> outcome. ``least``: proven lower bound on the harm, [n] m2/s2.
-    """
+    """Verdicts on what the paper says of single worlds, with the parameters as stated."""
     baseline, certain = outcomes[E_V2X_BM], least > 0.0
     severity = [
         Less.of_worlds(f"{name} minus {E_V2X_BM}", outcomes[name]["first"][certain], baseline["first"][certain])
@@ -280,7 +267,7 @@ def world_claims(outcomes: Mapping[str, RandomOutcome], least: Floats) -> list[C
 
 
 def bound_claim(name: str, bound: str, above: Mapping[str, int], worlds: int) -> Claim:
-    """Verdict: the harm of no hybrid is above a bound in any world.
+    """The harm of no hybrid is above a bound in any world.
 
     ``above``: strategy -> number of worlds in which its harm is above it.
     """
@@ -290,7 +277,7 @@ def bound_claim(name: str, bound: str, above: Mapping[str, int], worlds: int) ->
 
 
 def count_worse(outcome: RandomOutcome, baseline: RandomOutcome) -> int:
-    """Number of worlds in which a strategy does more first-impact harm, or more total harm, than ``baseline``."""
+    """First-impact or total harm."""
     return int(np.count_nonzero(np.any([outcome[harm] > baseline[harm] + ROUNDING for harm in HARMS], axis=0)))
 
 
@@ -320,7 +307,6 @@ def gradient_claim(outcomes: Mapping[str, RandomOutcome], episodes: int) -> Clai
 
 
 def contribution_claims(settings: ReproductionSettings, episodes: int) -> list[Claim]:
-    """Verdicts on both contributions with policies trained as in the paper, in its fixed-step map."""
     outcomes, courses = process_outcomes(STATED, episodes, settings), courses_of(settings, RANDOM)
     return [
         judge_trained(f"{name} by the process", {policy: courses[policy]}, compare_over_seeds(seeds, name, rival))
@@ -330,7 +316,7 @@ def contribution_claims(settings: ReproductionSettings, episodes: int) -> list[C
 
 
 def reproduce_random_table(settings: ReproductionSettings) -> Made:
-    """Table III (``Table:Random``): verdicts on its numbers, the conclusions from it and the paper's contributions."""
+    """Table III (``Table:Random``)."""
     episodes = settings.episodes
     least = proven_least_harm(STATED, episodes)
     in_map = least_rates_in_map(episodes, least)
@@ -354,7 +340,7 @@ def reproduce_random_table(settings: ReproductionSettings) -> Made:
 
 
 def reproduce_hybrid_table(settings: ReproductionSettings) -> Made:
-    """Table II (``Table:hybrid``): verdicts on its numbers and conclusions, with our policy that has not converged."""
+    """Table II (``Table:hybrid``), with our policy that has not converged."""
     episodes, spec = min(STOPPED_WORLDS, settings.episodes), unconverged_policy(settings.folder)
     least = proven_least_harm(STATED, episodes)
 

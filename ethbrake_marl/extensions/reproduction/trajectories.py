@@ -40,10 +40,7 @@ def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Recor
 
 @in_our_style
 def road_figure(records: Records, caption: str) -> Figure:
-    """Draw the positions of the vehicles along the road in four episodes, one panel each, with an arrow every second.
-
-    Dashed lines join the vehicles at the same time. ``records``: (policy, scenario number) -> episode.
-    """
+    """Dashed lines join the vehicles at the same time. ``records``: (policy, scenario number) -> episode."""
     figure, panels = new_panels((10.0, 4.8), 2, 2, sharex=True, sharey=True)
     for axes, ((name, number), record) in zip(panels, records.items(), strict=True):
         vehicles = np.arange(1, record.positions_m.shape[1] + 1)
@@ -60,10 +57,7 @@ def road_figure(records: Records, caption: str) -> Figure:
 
 @in_our_style
 def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
-    """Draw the commands of Vehicle 2 over time: one panel for each policy and scenario, with a curve for each reading.
-
-    ``curves``: reading (interpretation of the paper's text) -> (policy, scenario number) -> episode.
-    """
+    """Commands of Vehicle 2 over time: one panel for each policy and scenario, with a curve for each reading."""
     figure, all_axes = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
     for axes, key in zip(all_axes, next(iter(curves.values())), strict=True):
         axes.axhline(0.0, color=GREY, linewidth=0.8)
@@ -93,7 +87,7 @@ def all_records(settings: ReproductionSettings) -> dict[str, Records]:
 
 
 def reproduce_trajectories(settings: ReproductionSettings) -> Made:
-    """Fig. 6: positions in Scenarios 1 and 2 under PPO and SAC, and the paper's statements about them."""
+    """Fig. 6."""
     readings, parts = all_records(settings), []
     figures = []
     for number, (name, records) in enumerate(readings.items(), 1):
@@ -121,7 +115,7 @@ def reproduce_trajectories(settings: ReproductionSettings) -> Made:
 
 
 def reproduce_accelerations(settings: ReproductionSettings) -> Made:
-    """Fig. 7: commands of Vehicle 2 in Scenarios 1 and 2 under PPO and SAC, and the paper's statements about them."""
+    """Fig. 7."""
     readings, parts = all_records(settings), []
     text = "Command of Vehicle 2 over time, as the paper states the latencies and under other readings."
     figure = DrawnFigure("accelerations", "Acceleration profiles", text, profiles_figure(readings, text))
@@ -167,8 +161,8 @@ def reproduce_accelerations(settings: ReproductionSettings) -> Made:
 def resample_pair(records: Records, number: int, what: str, column: int) -> list[Floats]:
     """A recorded quantity under PPO and under SAC, [k] each, at the same k times.
 
-    ``number``: scenario of the paper, 1 or 2. ``what``: attribute of ``EpisodeRecord``. ``column``: vehicle or pair,
-    from 0. After an episode has ended, its last value is repeated.
+    ``what``: attribute of ``EpisodeRecord``. ``column``: vehicle or pair, from 0. After an episode has ended, its last
+    value is repeated.
     """
     pair = [records[name, number] for name in ("PPO", "SAC")]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
@@ -176,18 +170,13 @@ def resample_pair(records: Records, number: int, what: str, column: int) -> list
 
 
 def policy_difference(records: Records, number: int, what: str) -> float:
-    """Root mean square over time of the difference between PPO and SAC in a recorded quantity of Vehicle 2.
-
-    ``number``: scenario of the paper, 1 or 2. ``what``: attribute of ``EpisodeRecord``.
-    """
+    """Root mean square over time of the difference between PPO and SAC in a recorded quantity of Vehicle 2."""
     ppo, sac = resample_pair(records, number, what, VEHICLE_2_COLUMN)
     return float(np.sqrt(np.mean((ppo - sac) * (ppo - sac))))
 
 
 def claims_of(readings: Sequence[Mapping[str, tuple[str, float]]], settings: ReproductionSettings) -> list[Claim]:
-    """Verdicts on claims of the paper that one quantity is smaller than another in a single world.
-
-    A claim agrees, or differs, if the shipped policies and all those of the paper's process say so, and else is
+    """A claim agrees, or differs, if the shipped policies and all those of the paper's process say so, and else is
     undecided. ``readings``: results with the parameters as stated, in the nearest reading and for each seed of the
     paper's process. Each maps a claim to numbers in words, and to the smaller quantity minus the larger one.
     """

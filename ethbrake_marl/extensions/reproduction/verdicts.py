@@ -41,8 +41,6 @@ COLUMNS = "Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Ver
 
 
 class Claim(NamedTuple):
-    """Our results on a number or statement of the paper, and our verdict."""
-
     name: str  # in its item
     ours: str  # our result with the parameters as stated
     nearest: str  # our result in the nearest reading
@@ -57,9 +55,7 @@ def paper_texts() -> Mapping[str, Any]:
 
 
 def sentences_sheet(claims: Mapping[str, Mapping[str, Claim]]) -> Sheet:
-    """Table of the paper's sentences, in the paper's order: our results, the verdict and the reason for this verdict.
-
-    ``claims``: item -> name -> claim. A sentence of an item that has no such claim was not run, and a sentence of
+    """``claims``: item -> name -> claim. A sentence of an item that has no such claim was not run, and a sentence of
     another item is left out.
     """
     rows = []
@@ -78,10 +74,7 @@ def chance_difference(ours: Estimate) -> float:
 
 
 def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) -> Verdict:
-    """Verdict on a printed number (not 0) by the rules of this module.
-
-    ``ours``: our number. ``least``: proven lower bound for all strategies.
-    """
+    """``ours``: our number. ``least``: proven lower bound for all strategies."""
     if least is not None and least.value - printed > chance_difference(least):
         return "cannot be"
     if abs(ours.value - printed) <= VERDICT_TOLERANCE * abs(printed):
@@ -113,10 +106,8 @@ class Less(NamedTuple):
 
 
 def judge_statement(parts: Sequence[Less]) -> tuple[str, Verdict, str]:
-    """Result in words, verdict and details in words, for a statement that some quantities are smaller than others.
-
-    The result says in how many of the comparisons ``parts`` the statement holds. The details are the differences of the
-    comparisons that fail or, if none fails, of the closest one.
+    """The result says in how many of the comparisons ``parts`` the statement holds. The details are the differences of
+    the comparisons that fail or, if none fails, of the closest one.
     """
     compared = [part for part in parts if not part.both_are_0]
     failing = [part for part in compared if not part.holds]
@@ -133,10 +124,8 @@ def judge_statement(parts: Sequence[Less]) -> tuple[str, Verdict, str]:
 
 
 def judge(name: str, stated: Sequence[Less], nearest: Sequence[Less] = (), *, numbers: str = "") -> Claim:
-    """Claim with our verdict on a statement of the paper.
-
-    ``stated``, ``nearest``: comparisons with the parameters as stated, and in the nearest reading. ``numbers``: what to
-    show beside the result; "": the differences that decide.
+    """``stated``, ``nearest``: comparisons with the parameters as stated, and in the nearest reading. ``numbers``: what
+    to show beside the result; "": the differences that decide.
     """
     text, verdict, details = judge_statement(stated)
     nearest_result = judge_statement(nearest)[0] if nearest else ""

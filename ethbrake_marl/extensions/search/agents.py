@@ -64,7 +64,7 @@ class Planner(Predicting):
         return SearchMemory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        """Commands of vehicle ``body`` at all T decisions, [n, T] m/s2, and what they cost, [n] m2/s2."""
+        """At all T decisions, [n, T] m/s2, and what they cost, [n] m2/s2."""
         raise NotImplementedError
 
     def act(self, state: State, memory: SearchMemory, body: int) -> tuple[Floats, SearchMemory]:
@@ -76,7 +76,7 @@ class Planner(Predicting):
 
 
 class BestHarm(Planner):
-    """Agent that drives the best known commands: from a shipped table, or from a search.
+    """Drives the best known commands: from a shipped table, or from a search.
 
     If it is the only learner, it never does more harm than E-V2X-BM and a shipped policy, whose commands are improved
     once more. Several learners with one objective follow the joint optimum of an ablation: the best known commands of
@@ -99,7 +99,7 @@ class BestHarm(Planner):
         return plan._replace(commands_mps2=plan.commands_mps2[:, :, learners.index(body)])
 
     def joint_plan(self, alert: State) -> SearchMemory:
-        """Commands of all L learners, [n, T, L] m/s2."""
+        """[n, T, L] m/s2."""
         check_known_commands(self.scenario, self.scenario.learners)
         game, objective = game_of(self.scenario, {}, "harm")[1], self.scenario.objective
         problem = problem_of(game, alert, harm_count=self.harm_count, objective=objective)
@@ -136,7 +136,7 @@ class BestHarm(Planner):
         return commands, harm
 
     def search(self, game: Game, alert: State, problem: Problem, body: int, steps: int) -> tuple[Floats, Floats]:
-        """Best commands of vehicle ``body`` by a search, [n, ``steps``] m/s2, and what they cost, [n] m2/s2."""
+        """[n, ``steps``] m/s2, and what they cost, [n] m2/s2."""
         profiles, values = search_profiles(problem, [e_v2x_bm_profiles(problem, alert)], budget=self.budget)
         best = profiles.stepwise(steps)[:, :, 0]
         if self.scenario.learners != (body,):
@@ -152,7 +152,7 @@ class BestHarm(Planner):
 
 
 class SearchAround(Planner):
-    """Agent that improves another agent's commands by a search at the alert, so it never does more harm."""
+    """It never does more harm than the other agent."""
 
     def __init__(
         self, inner: Agent, scenario: Scenario, harm_count: AnyCount = HONEST, candidates: int = SEARCH_CANDIDATES
@@ -182,7 +182,6 @@ def single_learner_game(scenario: Scenario, alert: State, body: int) -> tuple[Ga
 
 
 def check_known_commands(scenario: Scenario, bodies: Sequence[int]) -> None:
-    """Raise ``InvalidInput`` if the commands of a vehicle that is not among ``bodies`` are not known at the alert."""
     for vehicle, role in enumerate(scenario.roles.values(), 1):
         if vehicle not in bodies and role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):
             raise InvalidInput(

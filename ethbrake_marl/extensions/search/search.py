@@ -93,7 +93,7 @@ def search_profiles(
 
 
 def join_profiles(parts: Sequence[Profiles], n: int) -> Profiles:
-    """Profiles of all ``parts`` ([n * q] each, of equally many phases), arranged by world, [n, Q]."""
+    """``parts``: [n * q] each, of equally many phases; arranged by world, [n, Q]."""
     K, B = parts[0].commands_mps2.shape[1:]
     ends = np.concatenate([part.ends.reshape(n, -1, K) for part in parts], axis=1)
     return Profiles(ends, np.concatenate([part.commands_mps2.reshape(n, -1, K, B) for part in parts], axis=1))

@@ -33,8 +33,6 @@ OF_COUNT = {"harm": ("<f8", 1), "ends": ("<u2", 2), "commands": ("<f8", 3)}  # a
 
 @dataclass(frozen=True, slots=True)
 class BestHarmTable:
-    """Least known harm of n worlds in some counts of harm, with the profiles (commands over time) that reach it."""
-
     identity: UInt64s  # [n] hash of each world (``pricing.identities``)
     harm: Mapping[str, Floats]  # name of a count -> [n] m2/s2, or what else the search has minimised
     profiles: Mapping[str, Profiles]  # count -> profiles with this harm
@@ -44,7 +42,7 @@ class BestHarmTable:
 
     @classmethod
     def load(cls, path: Path) -> BestHarmTable:
-        """Read a table. Raises ``InvalidInput`` and ``CorruptBundle``."""
+        """Raises ``InvalidInput`` and ``CorruptBundle``."""
         if not path.exists():
             raise InvalidInput(f"{path}: there is no such file; give the file of a table of best known harm")
         data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
@@ -63,7 +61,6 @@ class BestHarmTable:
         return cls(arrays["identity"], harm, profiles, header)
 
     def save(self, path: Path) -> None:
-        """Write a compressed .npz file, completely or not at all."""
         write_file(path, self.content())
 
     def content(self) -> bytes:
@@ -77,7 +74,7 @@ class BestHarmTable:
         return buffer.getvalue()
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
-        """Row of this table for each world in ``identity`` [n]; -1 for a world that is not in the table."""
+        """-1 for a world that is not in the table."""
         order = np.argsort(self.identity, kind="stable")
         rows = order[np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)]
         return np.where(self.identity[rows] == identity, rows, -1)
@@ -113,12 +110,12 @@ def _load_shipped() -> tuple[BestHarmTable, ...]:
 
 
 def shipped_tables() -> tuple[BestHarmTable, ...]:
-    """Shipped tables that were made with this installation's physics, in the order of their files' names."""
+    """Only those made with this installation's physics."""
     return tuple(table for table in _load_shipped() if table.header.get("physics") == physics_digest())
 
 
 def outdated_tables() -> dict[str, str]:
-    """Shipped tables that are not used, scenario -> sentence with the reason, which is other physics."""
+    """Scenario -> sentence with the reason."""
     now = physics_digest()
     physics_of_tables = {table.header["scenario"]: table.header.get("physics") for table in _load_shipped()}
     return {
