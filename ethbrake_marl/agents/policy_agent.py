@@ -23,7 +23,7 @@ from ethbrake_marl.agents.foreign import (
 )
 from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
 from ethbrake_marl.episode.counts import COUNTS, HarmCount
-from ethbrake_marl.episode.features import GROUPS, group_named
+from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
 from ethbrake_marl.episode.observe import Observations, View
@@ -133,12 +133,14 @@ class LearnedAgent(RangeObserver):
 
 @cache
 def with_known(view: View, fallback: str) -> tuple[View, int | None]:
-    """``view`` and the feature ``known`` of the group of ``fallback``, and the column of this feature; None: none."""
-    group = fallback.partition(".")[0]
-    if "known" not in [feature.name for feature in group_named(group) or ()]:
+    """``view`` and the feature ``known`` that the function of ``fallback`` computes, and its column; None: none."""
+    groups, group = GROUPS.usable(), fallback.partition(".")[0]
+    together = [name for name in groups if group in groups and groups[name].function is groups[group].function]
+    flags = [f"{name}.known" for name in together if "known" in [feature.name for feature in groups[name].features]]
+    if not flags:
         return view, None
-    names = list(dict.fromkeys([*view.names, f"{group}.known"]))
-    return View(names), names.index(f"{group}.known")
+    names = list(dict.fromkeys([*view.names, flags[0]]))
+    return View(names), names.index(flags[0])
 
 
 @dataclass(frozen=True)

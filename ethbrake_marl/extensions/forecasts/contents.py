@@ -2,5 +2,10 @@
 
 CONTENTS = {
     "agents": {"plan": "plan:AGENT"},
-    "feature_groups": {"contact": "contacts:NEAR_GROUP", "contact_far": "contacts:FAR_GROUP", "plan": "plan:GROUP"},
+    "feature_groups": {
+        "contact": "contacts:NEAR_GROUP",
+        "contact_far": "contacts:FAR_GROUP",
+        "plan": "plan:GROUP",
+        "forecast": "plan:FORECAST_GROUP",
+    },
 }

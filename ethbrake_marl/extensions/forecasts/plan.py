@@ -70,13 +70,13 @@ PLAN = (
         for vehicle, whose in {"own": "this vehicle", **SIDES}.items()
         for change in ("build_up", "release")
     ),
-    Feature("known", "1", 1.0, 0.0, 1.0, "0 if a neighbour of which this vehicle knows cannot be predicted"),
 )
+FORECAST = (Feature("known", "1", 1.0, 0.0, 1.0, "0 if a neighbour of which this vehicle knows cannot be predicted"),)
 
 
 @large
 def plan_worlds(line, car, clock, know, observers, time_step_s, weights, memory, out):
-    """Write the features ``plan``, before scaling, to ``out`` [n, observers, F].
+    """Write the features ``plan`` and ``forecast``, before scaling, to ``out`` [n, observers, F].
 
     Returns the index of a world in which the simulation failed, or -1. ``line``, ``car``, ``clock``, ``know``: as in
     ``State``. ``observers``: numbers of the observing bodies. ``weights``: of the cost (``episode.counts``).
@@ -137,10 +137,13 @@ def middle_of_least(costs):
 
 
 def _plans(state: State, observers: Ints, time_step_s: float) -> Floats:
-    """Features ``plan`` before scaling, [n, observers, F]. Raises ``PhysicsError`` if a simulation fails."""
+    """Features ``plan`` and ``forecast`` before scaling, [n, observers, F].
+
+    Raises ``PhysicsError`` if a simulation fails.
+    """
     require(state, "a plan", SHOWN)
     bodies = state.wanted.shape[1]
-    out = np.empty((state.n, len(observers), len(PLAN)))
+    out = np.empty((state.n, len(observers), len(PLAN + FORECAST)))
     line, observer_line, parameters = (np.zeros((rows, bodies)) for rows in (LINE_ROWS, LINE_ROWS, CAR_ROWS))
     trials, costs = np.zeros((TRIALS, PER_COMMAND)), np.zeros(TRIALS)
     memory = scratch_for(bodies), line, observer_line, parameters, np.zeros(bodies), trials, costs
@@ -176,7 +179,8 @@ def make_plan(argument: str | None, settings: Any) -> PlanAgent:
     return PlanAgent()
 
 
-GROUP = Part(PLAN, _plans)
+GROUP = Part(PLAN, _plans, slice(0, len(PLAN)))
+FORECAST_GROUP = Part(FORECAST, _plans, slice(len(PLAN), None))  # apart, so that `plan` keeps its length
 AGENT = Part(
     make_plan,
     form="plan",

@@ -183,9 +183,9 @@ def test_the_first_plan__is_the_best_constant_action_of_the_worst_corner_where_i
     memory = first(scenario, uncertainty="gaps_m=3")
     _, game = eb.open_game(scenario)
     state = game.reset(members("gaps_m=3", scenario.sample(1, 7)))
-    tried = [eb.price(game, state, np.full((5, 1, 1), -a), "first").max() for a in np.linspace(0.0, 1.0, 41)]
+    tried = [eb.price(game, state, np.full((5, 1, 1), -a), "honest").max() for a in np.linspace(0.0, 1.0, 41)]
     assert memory.price[0] <= min(tried) + 1e-9
-    alone = eb.price(game, state, np.repeat(memory.plan, 5, axis=0), "first")
+    alone = eb.price(game, state, np.repeat(memory.plan, 5, axis=0), "honest")
     assert memory.price[0] == alone.max() and len(set(alone)) > 2
 
 

@@ -14,7 +14,7 @@ from tests.episode.lines import later, state_of
 pytest.importorskip("ethbrake_marl.extensions.messages")
 
 PIECES = ["place", "speed", "acceleration", "braking_capacity", "latency", "mass"]
-FORECASTS = ["plan", "contact", "contact_far"]
+FORECASTS = ["plan", "forecast", "contact", "contact_far"]
 
 
 def without(scenario: Any, piece: str, senders: list[int], **v2x: Any) -> eb.Scenario:
@@ -56,8 +56,8 @@ def test_forecast__waits_until_the_neighbour_can_be_predicted() -> None:
     sight = {"link_latency_s": 0.0, "senses": "front", "sensing_s": [0.9, 0.9]}
     scenario = without("paper-random", "acceleration", [1], **sight)
     before, after = observed(scenario, 0.7), observed(scenario, 1.0)
-    assert (before["front_1.known"] == 1.0).all() and (before["plan.known"] == 0.0).all()
-    assert (before["plan.action"] == -1.0).all() and (after["plan.known"] == 1.0).all()
+    assert (before["front_1.known"] == 1.0).all() and (before["forecast.known"] == 0.0).all()
+    assert (before["plan.action"] == -1.0).all() and (after["forecast.known"] == 1.0).all()
     times = [name for name in before if name.endswith("_time") and "own_" not in name]
     assert len(times) > 10 and not any(before[name].any() for name in times)
     assert all(after[name].all() for name in ("plan.brake_front_time", "contact.brake_rear_time"))

@@ -110,7 +110,9 @@ def test_bounds__of_shipped_lists(name):
     horizon, any_time, decided = RECORDED[name]
     state = eb.load_scenario(name).sample(6, seed=7)
     assert lower_bound(state, harm_count="first", horizon_s=horizon).harm == pytest.approx(any_time, rel=1e-12)
-    assert lower_bound(state, harm_count="first", horizon_s=horizon, time_step_s=0.1).harm == pytest.approx(decided, rel=1e-12)
+    assert lower_bound(state, harm_count="first", horizon_s=horizon, time_step_s=0.1).harm == pytest.approx(
+        decided, rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("rounds", [60, pytest.param(10_000, marks=pytest.mark.slow)])
@@ -128,7 +130,9 @@ def test_bound__no_searched_commands_are_below_it_and_some_are_near(rounds):
 def test_decisions__leave_less_room_and_no_plan_is_below():
     scenario, game = eb.open_game("paper-random")
     state = scenario.sample(100, seed=7)
-    any_time, decided, often = (lower_bound(state, harm_count="first", time_step_s=step).harm for step in (None, 0.1, 1e-3))
+    any_time, decided, often = (
+        lower_bound(state, harm_count="first", time_step_s=step).harm for step in (None, 0.1, 1e-3)
+    )
     assert np.all(any_time <= decided) and decided.mean() > 1.02 * any_time.mean()
     assert often.mean() < 1.01 * any_time.mean()
     begun, least = game.reset(state), np.full(100, np.inf)
