@@ -22,7 +22,7 @@ def test_harm_count__is_what_agents_lower(ethbrake: Command) -> None:
 
 
 def test_tables__show_all_counts_and_say_which_one_agents_minimise(ethbrake: Command) -> None:
-    arguments = ("evaluate", "--episodes", "40", "--agents", "full_brake,e_v2x_bm,vine-paper")
+    arguments = ("evaluate", "--episodes", "40", "--agents", "full_brake,e_v2x_bm,ppo")
     usual, paper = (ethbrake(*arguments, *more).out for more in ((), ("--set", "harm_count=first")))
     for shown in (usual, paper):
         assert {"First-impact", "Total", "Honest"} <= {*shown.split()}

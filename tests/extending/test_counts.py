@@ -34,17 +34,16 @@ def cost(state: Any) -> np.ndarray:
 
 def test_count__stands_in_columns_summaries_and_measures() -> None:
     result = eb.evaluate(
-        "paper-random", "full_brake,e_v2x_bm,vine-paper", episodes=60, harm_count="shoves", measures="worst5,maximin"
+        "paper-random", "full_brake,e_v2x_bm,ppo", episodes=60, harm_count="shoves", measures="worst5,maximin"
     )
     own = result["e_v2x_bm"]
     assert own["predicted_harm"].tolist() == own["shove_cost"].tolist()
     assert {"shove_cost_3", "worst5_shoves", "maximin_shoves"} < {*own}
     by_hand = (
-        result["vine-paper"]["total_harm"]
-        + 5.0
-        * eb.evaluate("paper-random", "vine-paper", episodes=60, measures="pushed_mps")["vine-paper"]["pushed_mps"]
+        result["ppo"]["total_harm"]
+        + 5.0 * eb.evaluate("paper-random", "ppo", episodes=60, measures="pushed_mps")["ppo"]["pushed_mps"]
     )
-    assert result["vine-paper"]["shove_cost"] == pytest.approx(by_hand)
+    assert result["ppo"]["shove_cost"] == pytest.approx(by_hand)
     table = eb.summarise(result)
     assert "Agents minimise shove cost" in str(table) and {"Shove cost", "Worst 5 %, shove cost"} < {
         *table.sheet().headings
@@ -73,11 +72,11 @@ def test_count__is_rewarded_and_stands_in_recipes() -> None:
 
 @pytest.mark.parametrize("mode", ["step", "episode"])
 def test_count__is_bounded_by_shields(mode: str) -> None:
-    team = eb.shield(eb.make_agent("vine-paper"), mode=mode, scenario="paper-random", harm_count="shoves")
+    team = eb.shield(eb.make_agent("ppo"), mode=mode, scenario="paper-random", harm_count="shoves")
     scenario, game = eb.open_game("paper-random")
     alert = scenario.sample(60, 7)
     last = eb.play_to_end(game, alert, team)
-    alone = eb.play_to_end(game, alert, eb.Team("alone", {2: eb.make_agent("vine-paper")}))
+    alone = eb.play_to_end(game, alert, eb.Team("alone", {2: eb.make_agent("ppo")}))
     memory = last.memories["shield"]
     least = memory.price if mode == "step" else np.minimum(memory.policy_harm, memory.bound_harm)
     assert (last.harm("shoves") == least).all() and (alone.harm("shoves") > least + 1.0).any()
