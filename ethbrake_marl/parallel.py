@@ -14,7 +14,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from functools import cache
 from itertools import islice
 from multiprocessing import resource_tracker
@@ -114,8 +114,24 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
                 "a worker process was killed, perhaps because memory ran out; use fewer processes at once (--jobs)"
             ) from None
         finally:
-            with warnings.catch_warnings(action="ignore"):  # warnings about calls that are cancelled
+            with warnings.catch_warnings(action="ignore"), _silent_joblib():  # warnings about calls that are cancelled
                 getattr(results, "close", list)()
+
+
+@contextmanager
+def _silent_joblib() -> Iterator[None]:
+    """Context in which an exception in joblib's thread prints nothing: it may fill a queue that is closed."""
+    before = threading.excepthook
+
+    def tell(arguments: threading.ExceptHookArgs) -> None:
+        if arguments.thread is None or arguments.thread.name != "ExecutorManagerThread":
+            before(arguments)
+
+    threading.excepthook = tell
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 def _pickle_call(call: Call) -> bytes:
