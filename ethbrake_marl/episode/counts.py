@@ -62,7 +62,8 @@ class HarmCount:
 
     def __post_init__(self) -> None:
         where = f"count {self.name!r:.60}"
-        for what, text, form in (("name", self.name, "[a-z][a-z0-9-]{0,31}"), ("column", self.column, "[a-z][a-z_]+")):
+        column_form = "(?!predicted_|proven_)[a-z][a-z_]*_(cost|harm)"  # as no other column of an evaluation
+        for what, text, form in (("name", self.name, "[a-z][a-z0-9-]{0,31}"), ("column", self.column, column_form)):
             if not isinstance(text, str) or re.fullmatch(form, text) is None:
                 raise InvalidInput(f"{where}: {what} = {text!r:.60}: must have the form {form}")
         if not isinstance(self.words, str) or not self.words.strip() or not self.words.isprintable():
@@ -114,7 +115,7 @@ def register_count(
     count = HarmCount(name, np.array(weights), column, words, tuple(requires))
     if column in {other.column for other in COUNTS.loaded.values() if other.name != name}:
         raise InvalidInput(f"count {name!r}: column = {column!r}: is the column of another count; give another name")
-    COUNTS.add(name, count, lambda known: known == count and np.array_equal(known.weights, weights))
+    COUNTS.add(name, count, lambda known: known == count and np.array_equal(known.weights, count.weights))
 
 
 COUNTS: Registry[HarmCount] = Registry(

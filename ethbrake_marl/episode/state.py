@@ -9,7 +9,7 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount, all_counts, amount_so_far, pair_amounts
 from ethbrake_marl.episode.departures import MARKS, SHOWN, departing_worlds
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import (
@@ -95,8 +95,9 @@ class State(NamedTuple):
         """Random generator of each world for what happens to vehicle ``body``, such as its reaction time, [n].
 
         It depends on seed and number of the world alone, so it is the same for every agent. Each call returns new
-        generators, at their first number.
+        generators, at their first number. Raises ``InvalidInput`` for a vehicle that the line lacks.
         """
+        check_whole_number("body", body, 1, self.vehicles)
         keys = np.ascontiguousarray(self.clock[:, KEY]).view(np.uint64)
         return [np.random.Generator(np.random.Philox(key=[key, body])) for key in keys.tolist()]
 

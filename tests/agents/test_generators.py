@@ -8,7 +8,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import AgentFailed
+from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.evaluate import evaluate_teams
 from ethbrake_marl.worlds.open_game import game_of
 from ethbrake_marl.worlds.user_worlds import worlds_from_state
@@ -109,3 +109,9 @@ def test_script_that_draws_for_itself__is_refused_in_one_line(what: str) -> None
 def test_script_that_answers_alike__is_not(what: str) -> None:
     first, second = harm(PAPER, ALIKE[what], n=5)
     assert first.tobytes() == second.tobytes()
+
+
+@pytest.mark.parametrize("body", [0, 4, -1, 1.5, True, None])
+def test_generators__of_a_vehicle_that_the_line_lacks_are_refused(body: Any) -> None:
+    with pytest.raises(InvalidInput, match=r"body = .*: must be a whole number in 1\.\.3"):
+        eb.load_scenario("paper-random").sample(1, 7).generators(body)

@@ -95,18 +95,22 @@ def test_count__needs_what_it_requires() -> None:
     eb.register_count("half", [0.5, 0, 0, 0, 0, 0], column="half_harm", words="half harm")
     assert eb.load_scenario("paper-random").sample(1, 7).harm("half").tolist() == [0.0]
     for name, weights, column, requires, told in (
-        ("shoves", [1, 0, 0, 0, 0, 0], "other", (), "count 'shoves' is registered already"),
+        ("shoves", [1, 0, 0, 0, 0, 0], "other_cost", (), "count 'shoves' is registered already"),
         ("new", [1, 0, 0, 0, 0, 0], "total_harm", (), "column = 'total_harm': is the column of another count"),
-        ("New", [1, 0, 0, 0, 0, 0], "new", (), "name = 'New': must have the form"),
-        ("new", [1, 0], "new", (), "must be 6 finite numbers, each 0 or more"),
-        ("new", "heavy", "new", (), "must be 6 finite numbers, each 0 or more"),
-        ("new", [1, 0, 0, -1, 0, 0], "new", (), "must be 6 finite numbers, each 0 or more"),
-        ("new", [0, 1, 0, 1, 0, 0], "new", (), "requires = (): must be ('exact impacts',)"),
-        ("new", [0, 1, 0, 1, 0, 0], "new", ("luck",), "requires = ('luck',): must be ('exact impacts',)"),
+        ("New", [1, 0, 0, 0, 0, 0], "new_cost", (), "name = 'New': must have the form"),
+        ("new", [1, 0], "new_cost", (), "must be 6 finite numbers, each 0 or more"),
+        ("new", "heavy", "new_cost", (), "must be 6 finite numbers, each 0 or more"),
+        ("new", [1, 0, 0, -1, 0, 0], "new_cost", (), "must be 6 finite numbers, each 0 or more"),
+        ("new", [0, 1, 0, 1, 0, 0], "new_cost", (), "requires = (): must be ('exact impacts',)"),
+        ("new", [0, 1, 0, 1, 0, 0], "new_cost", ("luck",), "requires = ('luck',): must be ('exact impacts',)"),
+        ("new", [1, 0, 0, 0, 0, 0], "collided", (), "column = 'collided': must have the form"),
+        ("new", [1, 0, 0, 0, 0, 0], "predicted_harm", (), "column = 'predicted_harm': must have the form"),
     ):
         with pytest.raises((InvalidInput, AlreadyExists)) as error:
             eb.register_count(name, weights, column=column, words="new cost", requires=requires)
         assert told in str(error.value) and name in str(error.value)
     with pytest.raises(InvalidInput, match=r"harm_count = 'shove': must be 'first', 'total', 'honest', .*'half'"):
         eb.make_agent("e_v2x_bm", scenario="paper-random", harm_count="shove")
+    eb.register_count("texts", ["1", 0, 0, 0, 0, 0], column="texts_cost", words="cost of texts")  # type: ignore[list-item]
+    assert COUNTS["texts"].weights.tolist() == [1, 0, 0, 0, 0, 0]
     assert COUNTS["shoves"] == COUNTS["shoves"].of("shoves")
