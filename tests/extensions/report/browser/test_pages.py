@@ -57,7 +57,7 @@ def test_first_table__shows_the_push_without_scrolling(open_page: Open, tmp_path
     path = tmp_path / "report.html"
     ReportPage("t", compared_by("paper-random", "full_brake,e_v2x_bm:pairwise", 60, "honest"), "s", {}).write(path)
     page = open_page(path.as_uri(), width=1_100)
-    for width in (1_100, 900):  # beside the figure, below it
+    for width in (2_560, 1_440, 1_100, 900):  # beside the figure, below it
         page.set_viewport_size({"width": width, "height": 900})
         room, needed = page.evaluate("(e => [e.clientWidth, e.scrollWidth])(document.querySelector('.beside .wide'))")
         assert needed <= room, width
