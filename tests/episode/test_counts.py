@@ -152,7 +152,7 @@ def test_borne_harm__sums_to_that_of_the_line(name: str) -> None:
         assert own.sum(axis=1) == near(cost, rel=1e-12) and (own >= 0.0).all()
     common = last.line[:, PUSHED].sum(axis=1) / last.vehicles  # all brake with all they have
     assert not last.line[:, ANSWERED].any()
-    impacts = last.borne_harm(eb.HarmCount("impacts", [0, 1, 1, 0, 0, 0], "impacts", "impacts", (EXACT_IMPACTS,)))
+    impacts = last.borne_harm(eb.HarmCount("impacts", [0, 1, 1, 0, 0, 0], "impact_harm", "impacts", (EXACT_IMPACTS,)))
     moving = np.where(last.moving[:, np.newaxis], np.nan, 0.0)
     assert np.nan_to_num(last.borne_harm() - impacts + moving - 10.0 * common[:, np.newaxis]) == near(0.0, abs=1e-9)
 
