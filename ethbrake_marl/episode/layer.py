@@ -69,6 +69,10 @@ class Layer:
         """
         return state
 
+    def predictable(self, state: State, body: int) -> State:
+        """The state for a forecast by vehicle ``body``: as ``seen``, but without vehicles that it cannot predict."""
+        return self.seen(state, body)
+
     def hides(self, alert: State, body: int) -> Bools:
         """For each body of the line: whether this layer hides something about it from vehicle ``body``, [n, N + 1]."""
         return np.zeros((alert.n, alert.vehicles + 1), np.bool_)
@@ -113,18 +117,24 @@ class Observer:
 
     layers: tuple[Layer, ...] = ()
 
+    def predictable(self, state: State, body: int) -> State:
+        """The state for a forecast by vehicle ``body``, through all layers."""
+        for layer in self.layers:
+            state = see_through(layer, state, body, "predictable")
+        return state
 
-def see_through(layer: Layer, state: State, body: int) -> State:
+
+def see_through(layer: Layer, state: State, body: int, method: str = "seen") -> State:
     """State as vehicle ``body`` sees it through one layer. Raises ``InvalidInput`` if the layer fails."""
     what = f"layer {type(layer).__name__}"
     try:
-        view = layer.seen(state, body)
+        view = getattr(layer, method)(state, body)
     except EthBrakeError:
         raise
     except Exception as error:
-        raise InvalidInput(f"{what}: seen fails: {describe_error(error)}") from error
+        raise InvalidInput(f"{what}: {method} fails: {describe_error(error)}") from error
     if not isinstance(view, State) or view.line.shape != state.line.shape:
-        raise InvalidInput(f"{what}: seen must return a State of the same {state.n} worlds and vehicles")
+        raise InvalidInput(f"{what}: {method} must return a State of the same {state.n} worlds and vehicles")
     return view
 
 

@@ -1,4 +1,4 @@
-"""Exponential, logarithm and normal quantile from + - * / and sqrt only, so that all machines get the same bits.
+"""Exponential, logarithm, normal quantile and a hash, from operations that have the same bits on all machines.
 
 The C library and numpy choose an implementation by the processor, and the last bits differ. Each error bound in this
 file is the largest error, rounded up, in a comparison with values of 40 digits.
@@ -196,3 +196,18 @@ def normal_quantile_each(values: Floats) -> Floats:
 def logistic(values: Floats) -> Floats:
     """``1 / (1 + e^-x)`` of every value x, in the same shape."""
     return 1.0 / (1.0 + exp_each(-values))
+
+
+@kernel
+def hash_number(key, a, b):
+    """Number in [0, 1) that depends on three numbers, each a whole number of 0 or more: a SplitMix64 hash.
+
+    ``key`` is below 2^53.
+    """
+    z = np.uint64(key) ^ (np.uint64(a + 1) * np.uint64(0x9E3779B97F4A7C15))
+    z ^= np.uint64(b + 1.0) * np.uint64(0xD1342543DE82EF95)
+    for _ in range(2):
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z ^= z >> np.uint64(31)
+    return float(z >> np.uint64(11)) * 2.0**-53

@@ -193,7 +193,7 @@ class MedianLine(NamedTuple):
         return np.asarray(~((far & news.pieces[:, :, :P_INTENT]).any(axis=(1, 2)) | struck.any(axis=1)))
 
     def message_contents(self, state: State, sample: Floats) -> Floats:
-        """All quantities of each body that its messages can contain, except the intent, [n, N + 1, PIECES - 1].
+        """All quantities of each body that its messages can contain, except intent and plan, [n, N + 1, P_INTENT].
 
         Places are distances (m) from this vehicle.
         """

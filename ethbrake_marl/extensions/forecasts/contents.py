@@ -1,7 +1,7 @@
 """Contents of this extension: group -> name -> module of this folder and object."""
 
 CONTENTS = {
-    "agents": {"plan": "plan:AGENT"},
+    "agents": {"plan": "planner:AGENT"},
     "feature_groups": {
         "contact": "contacts:NEAR_GROUP",
         "contact_far": "contacts:FAR_GROUP",

@@ -11,18 +11,13 @@ line, is that of coordinated brake control (Lu, Wang, Li and Zheng, Mathematical
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cache
-from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.episode.commands import command_of, commands_of
+from ethbrake_marl.episode.commands import command_of
 from ethbrake_marl.episode.counts import HONEST, amount_so_far
 from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.features import Feature
-from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
-from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.errors import PhysicsError
@@ -50,7 +45,6 @@ from ethbrake_marl.motion.layout import (
 from ethbrake_marl.registry import Part
 
 TRIALS, LEVELS = 9, 2  # brakings of one search, and searches
-STEP_S = 0.1  # decision step of impact features, on which actions do not depend
 SAME_COST = 1e-6  # costs that differ by less are equal (m2/s2)
 COMMANDS = {"best": "the plan", "brake": "full braking", "coast": "coasting"}
 COST = 2 * PER_SIDE  # place of the cost among the features of a command, after those of the impacts
@@ -155,35 +149,5 @@ def _plans(state: State, observers: Ints, time_step_s: float) -> Floats:
     return out
 
 
-@dataclass(frozen=True)
-class PlanAgent(Observer):
-    """Follows the plan, anew at every decision."""
-
-    name: str = "plan"
-    knows: str = MESSAGES
-
-    def begin(self, alert: State, body: int) -> None:
-        """None, because the agent has no memory."""
-
-    def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
-        actions = observe_through(self.layers, action_view(), state, body, STEP_S)[:, 0]
-        return commands_of(state, body, actions.astype(np.float64)), None
-
-
-@cache
-def action_view() -> View:
-    return View(["plan.action"])  # made late: the group must be registered
-
-
-def make_plan(argument: str | None, settings: Any) -> PlanAgent:
-    return PlanAgent()
-
-
 GROUP = Part(PLAN, _plans, slice(0, len(PLAN)))
 FORECAST_GROUP = Part(FORECAST, _plans, slice(len(PLAN), None))  # apart, so that `plan` keeps its length
-AGENT = Part(
-    make_plan,
-    form="plan",
-    about="at every decision, the constant braking of least forecast honest cost",
-    knows=MESSAGES,
-)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ethbrake_marl.episode.plans import PLANS_KEY
 from ethbrake_marl.episode.reach import within_reach
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -20,8 +21,10 @@ from ethbrake_marl.extensions.messages.links import (
     P_LATENCY,
     P_MASS,
     P_PLACE,
+    P_PLAN,
     P_SPEED,
     PIECES,
+    PLAN,
     MessageMemory,
     estimated_line,
     newest_samples,
@@ -59,7 +62,7 @@ def known_pieces(state: State, observer: int) -> Bools:
 
     *Pieces* are the quantities that a message can contain. Of another vehicle the observer knows nothing before
     ``state.know`` and, with periodic messages, before it has a sample. Then it knows the pieces that this vehicle's
-    messages contain (the intent, its newest command, only after its first message) and, if the vehicle is in sight,
+    messages contain (intent and plan only after its first message) and, if the vehicle is in sight,
     place, speed and acceleration. It knows all pieces of itself and of the obstacle.
     """
     memory: MessageMemory = state.memories[MESSAGES_KEY]
@@ -68,7 +71,8 @@ def known_pieces(state: State, observer: int) -> Bools:
     if memory.is_periodic:
         known &= memory.news[:, AT, observer] >= 0.0
     pieces = memory.contents.copy()
-    pieces[:, :, P_INTENT] &= (memory.links[:, MESSAGE_NUMBER, observer] > 0.0) | (memory.heard_s[:, observer] <= time)
+    has_message = (memory.links[:, MESSAGE_NUMBER, observer] > 0.0) | (memory.heard_s[:, observer] <= time)
+    pieces[:, :, [P_INTENT, P_PLAN]] &= has_message[:, :, np.newaxis]
     pieces[:, :, [P_PLACE, P_SPEED, P_ACCELERATION]] |= (memory.seen_s[:, observer] <= time)[:, :, np.newaxis]
     pieces &= known[:, :, np.newaxis]
     pieces[:, [0, observer]] = True
@@ -80,7 +84,7 @@ def belief_of(state: State, observer: int) -> State:
 
     Gaps add up to the distances between bodies with a known place. Old samples are extrapolated to the present
     (``links.estimate_worlds``). ``know`` is infinite for a body of which the observer knows nothing. ``wanted``
-    contains the newest intents (commands) received.
+    contains the newest intents (commands) received, the memory ``plans`` the newest plans.
     """
     known = known_pieces(state, observer)
     news = newest_samples(state, observer)
@@ -90,6 +94,7 @@ def belief_of(state: State, observer: int) -> State:
             array[:, row][~known[:, :, piece]] = np.nan
     wanted = np.where(known[:, :, P_INTENT], news[:, INTENT], np.nan)
     wanted[:, [0, observer]] = state.wanted[:, [0, observer]]  # the obstacle, and the observer itself
+    state = _with_plans(state, known, news)
     return state._replace(
         line=line, car=car, know=_known_if(state, observer, np.asarray(known.any(axis=2))), wanted=wanted
     )
@@ -98,12 +103,12 @@ def belief_of(state: State, observer: int) -> State:
 def predictable_belief_of(state: State, observer: int) -> State:
     """State as the body ``observer`` estimates it, without the vehicles that it cannot predict.
 
-    The observer can predict a vehicle of which it knows all quantities, except perhaps the intent. ``know`` is infinite
-    for all other bodies, and for those that cannot matter (``episode.reach``). If the observer knows something of a
-    neighbour that it cannot predict, it cannot predict itself either: then its own ``know`` is infinite, too.
+    The observer can predict a vehicle of which it knows all quantities, except perhaps intent and plan. ``know`` is
+    infinite for all other bodies, and for those that cannot matter (``episode.reach``). If the observer knows something
+    of a neighbour that it cannot predict, it cannot predict itself either: then its own ``know`` is infinite, too.
     """
-    known = known_pieces(state, observer)
-    line = estimated_line(state, observer, known, newest_samples(state, observer))
+    known, news = known_pieces(state, observer), newest_samples(state, observer)
+    line = estimated_line(state, observer, known, news)
     predictable: Bools = np.asarray(known[:, :, :P_INTENT].all(axis=2))
     first, last = within_reach(belief_of(state, observer), observer).T[:, :, np.newaxis]
     bodies = np.arange(known.shape[1])
@@ -111,7 +116,16 @@ def predictable_belief_of(state: State, observer: int) -> State:
     is_neighbour = np.abs(bodies - observer) == 1
     unpredicted = known.any(axis=2) & ~predictable & matters & is_neighbour
     predictable[unpredicted.any(axis=1), observer] = False
+    state = _with_plans(state, known, news)
     return state._replace(line=line, know=_known_if(state, observer, predictable & matters))
+
+
+def _with_plans(state: State, known: Bools, news: Floats) -> State:
+    """State with the newest plans that have been received, if messages tell plans."""
+    if not state.memories[MESSAGES_KEY].contents[:, 1:, P_PLAN].any():
+        return state
+    plans = np.where(known[:, np.newaxis, :, P_PLAN], news[:, PLAN], np.nan)
+    return state._replace(memories={**state.memories, PLANS_KEY: plans})
 
 
 def _known_if(state: State, observer: int, holds: Bools) -> Floats:

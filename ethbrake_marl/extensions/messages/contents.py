@@ -11,6 +11,12 @@ CONTENTS = {
         "latency_known": "features:KNOWN.latency",
         "mass_known": "features:KNOWN.mass",
         "intent_known": "features:KNOWN.intent",
+        "plan_known": "features:KNOWN.plan",
+        "plan_command_1": "features:PLAN_FEATURES.command_1",
+        "plan_command_2": "features:PLAN_FEATURES.command_2",
+        "plan_command_3": "features:PLAN_FEATURES.command_3",
+        "plan_change_1": "features:PLAN_FEATURES.change_1",
+        "plan_change_2": "features:PLAN_FEATURES.change_2",
     },
     "v2x_keys": {
         "persistence": "declared:DEFAULT_MESSAGES",

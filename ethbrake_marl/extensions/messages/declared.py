@@ -16,6 +16,7 @@ from ethbrake_marl.extensions.messages.links import (
     KEY,
     LOSS_BEGINS,
     LOSS_ENDS,
+    P_INTENT,
     PERIOD,
     PIECES,
     MessageMemory,
@@ -33,7 +34,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 LATER_LOSSES = (5,)  # stream of the numbers that decide which messages after the first are lost
 MOST_SAMPLES = 1_000  # that a vehicle may keep for delayed messages
-DEFAULT_CONTENT = PIECES[:-1]  # what a message contains unless the scenario says otherwise
+DEFAULT_CONTENT = PIECES[:P_INTENT]  # what a message contains unless the scenario says otherwise
 
 
 def _in_order(pieces: list[Piece]) -> list[Piece]:
@@ -61,7 +62,7 @@ class MessageKeys(ScenarioPart):
     ) = Field(
         default=None,
         description="contents of messages, for all vehicles or by vehicle name: place, speed, acceleration,"
-        " braking_capacity, latency, mass, intent; by default all but intent",
+        " braking_capacity, latency, mass, intent, plan; by default all but intent and plan",
     )
 
 

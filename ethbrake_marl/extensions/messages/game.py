@@ -24,6 +24,7 @@ from ethbrake_marl.extensions.messages.links import (
     MESSAGES_KEY,
     P_ACCELERATION,
     P_BRAKING,
+    P_INTENT,
     P_LATENCY,
     P_MASS,
     P_PLACE,
@@ -67,6 +68,9 @@ class MessagesLayer(Layer):
 
     def seen(self, state: State, body: int) -> State:
         return belief_of(state, body)
+
+    def predictable(self, state: State, body: int) -> State:
+        return predictable_belief_of(state, body)
 
     def hides(self, alert: State, body: int) -> Bools:
         """Bodies (0: obstacle) of which vehicle ``body`` does not know everything at its first decision, [n, N + 1]."""
@@ -158,5 +162,5 @@ class Believer(LayeredScript):
         """
         commands, memory = super().act(state, memory, body)
         if not np.isfinite(commands).all():
-            require_pieces(state, [body], f"script of vehicle_{body}", PIECES[:-1])
+            require_pieces(state, [body], f"script of vehicle_{body}", PIECES[:P_INTENT])
         return commands, memory

@@ -15,9 +15,11 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from ethbrake_marl.episode.plans import PLAN_NUMBERS, plans_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import hold_commands
 from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.elementary import hash_number
 from ethbrake_marl.motion.forces import ROUNDING_S
 from ethbrake_marl.motion.interval import solo
 from ethbrake_marl.motion.layout import (
@@ -37,9 +39,9 @@ from ethbrake_marl.motion.layout import (
 
 MESSAGES_KEY = "messages"  # of the memory in `State.memories`
 
-Piece = Literal["place", "speed", "acceleration", "braking_capacity", "latency", "mass", "intent"]  # of a message
+Piece = Literal["place", "speed", "acceleration", "braking_capacity", "latency", "mass", "intent", "plan"]
 PIECES: tuple[Piece, ...] = get_args(Piece)
-P_PLACE, P_SPEED, P_ACCELERATION, P_BRAKING, P_LATENCY, P_MASS, P_INTENT = range(len(PIECES))
+P_PLACE, P_SPEED, P_ACCELERATION, P_BRAKING, P_LATENCY, P_MASS, P_INTENT, P_PLAN = range(len(PIECES))
 
 # rows of a sample: one body at one moment
 AT = 0  # time of the sample (s); infinite: there is none
@@ -48,7 +50,8 @@ SAMPLE_SPEED = 2  # m/s
 SAMPLE_FORCE = 3  # m/s2
 OBSTACLE_HIT = 4  # 1 once Vehicle 1 has hit the obstacle
 INTENT = 5  # command chosen at the last decision (m/s2); the rows before it can be measured
-SAMPLE_ROWS = 6
+PLAN = slice(6, 6 + PLAN_NUMBERS)  # plan in force since the last decision (``episode.plans``)
+SAMPLE_ROWS = PLAN.stop
 
 # columns of `MessageMemory.channel`
 PERIOD = 0  # time between two messages of a link (s); 0: what is known is always the present state
@@ -120,13 +123,15 @@ def memory_at_alert(
 def present(state: State) -> Floats:
     """Sample that each body would send now, [n, SAMPLE_ROWS, N + 1] (body 0: the obstacle).
 
-    Places are relative to Vehicle 1. The intent of a vehicle is its last command, or 0 before it knows of the alert.
+    Places are relative to Vehicle 1. The intent of a vehicle is its last command, or 0 before it knows of the alert;
+    until then it has no plan.
     """
     sample = np.zeros((state.n, SAMPLE_ROWS, state.vehicles + 1))
     latency, time = state.car[:, LATENCY], state.time_s[:, np.newaxis]
     waits = (latency > state.car[:, OWN_LATENCY]) & ~((latency <= 0.0) | (latency < time - ROUNDING_S))
     sample[:, AT], sample[:, SAMPLE_SPEED], sample[:, SAMPLE_FORCE] = time, state.line[:, SPEED], state.line[:, FORCE]
     sample[:, OBSTACLE_HIT], sample[:, INTENT] = state.line[:, HIT, :1], np.where(waits, 0.0, state.wanted)
+    sample[:, PLAN] = np.where(waits[:, np.newaxis], np.nan, plans_of(state))
     sample[:, PLACE, 0], sample[:, PLACE, 2:] = state.line[:, GAP, 0], -np.cumsum(state.gaps_m, axis=1)
     return sample
 
@@ -220,7 +225,7 @@ def receive_worlds(rows, time, channel, seen_s, samples, links, news):
             while links[k, SENT, i, j] + channel[k, DELAY] <= time[k] + SAME_MOMENT_S:
                 number, bad = links[k, MESSAGE_NUMBER, i, j], links[k, BAD, i, j] == 1.0
                 if number > 0.0:
-                    u = loss_number(channel[k, KEY], (i - 1) * (bodies - 1) + j - 1, number)
+                    u = hash_number(channel[k, KEY], (i - 1) * (bodies - 1) + j - 1, number)
                     bad = u >= channel[k, LOSS_ENDS] if bad else u < channel[k, LOSS_BEGINS]
                 if not bad:
                     take_sample(samples[k], news[k], i, j, links[k, SENT, i, j], SAMPLE_ROWS)
@@ -243,21 +248,6 @@ def take_sample(samples, news, i, j, sent, rows):
             for row in range(rows):
                 news[row, i, j] = samples[s, row, j]
             return
-
-
-@kernel
-def loss_number(key, link, number):
-    """Random number in [0, 1) that decides whether message ``number`` of a link is lost: a SplitMix64 hash.
-
-    ``key``: random key of the world, the column KEY of ``MessageMemory.channel``. ``link``: number of the link.
-    """
-    z = np.uint64(key) ^ (np.uint64(link + 1) * np.uint64(0x9E3779B97F4A7C15))
-    z ^= np.uint64(number + 1.0) * np.uint64(0xD1342543DE82EF95)
-    for _ in range(2):
-        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        z ^= z >> np.uint64(31)
-    return float(z >> np.uint64(11)) * 2.0**-53
 
 
 @kernel

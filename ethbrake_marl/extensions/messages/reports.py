@@ -2,8 +2,8 @@
 
 Every vehicle sees the other vehicles' speeds with an error ``bias_mps + noise_mps z``, where z is a standard normal
 number for each world, vehicle and decision (one z for all messages before the first decision). The ``liar`` also seems
-neither to brake nor to drive. Messages contain these errors, so an old message keeps the error it was sent with. Gaps,
-and what a vehicle measures of itself, are exact.
+neither to brake nor to drive, and a plan that it tells says so. Messages contain these errors, so an old message keeps
+the error it was sent with. Gaps, and what a vehicle measures of itself, are exact.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 
 from ethbrake_marl.episode.layer import Layer
+from ethbrake_marl.episode.plans import PlanMemory
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.extensions.messages.links import loss_number
 from ethbrake_marl.files.model import require
 from ethbrake_marl.motion.compiling import large
-from ethbrake_marl.motion.elementary import normal_quantile_each
+from ethbrake_marl.motion.elementary import hash_number, normal_quantile_each
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats
 from ethbrake_marl.worlds.channel import V2X, ChannelKey
 from ethbrake_marl.worlds.counters import Numbers
@@ -31,6 +31,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 NAME = "reports"  # of the key, and of the memory: a whole number below 2^53 for each world, [n]
 NOISE = (6,)  # stream of these numbers
 MOST_MPS = 50.0  # largest noise and bias
+COASTING = 0.0  # each number of a plan of coasting
 
 
 @large
@@ -41,7 +42,7 @@ def chances(keys, steps, out):
     """
     for k in range(out.shape[0]):
         for i in range(out.shape[1]):
-            out[k, i] = loss_number(keys[k], i, steps[k])
+            out[k, i] = hash_number(keys[k], i, steps[k])
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,15 @@ class ReportsLayer(Layer):
 
     def seen(self, state: State, body: int) -> State:
         line, wanted, error = state.line.copy(), state.wanted.copy(), np.empty((state.n, state.vehicles))
+        memories = dict(state.memories)
         chances(state.memories[NAME], state.steps, error)
         error = self.bias_mps + self.noise_mps * normal_quantile_each(error)
         line[:, SPEED, 1:] += np.where(np.arange(1, state.vehicles + 1) == body, 0.0, error)
         if self.liar not in (0, body):
             line[:, FORCE, self.liar] = wanted[:, self.liar] = 0.0
-        return state._replace(line=line, wanted=wanted)
+            if isinstance(memory := memories.get(self.liar), PlanMemory):
+                memories[self.liar] = memory._replace(plan=np.where(np.isnan(memory.plan), np.nan, COASTING))
+        return state._replace(line=line, wanted=wanted, memories=memories)
 
     def hides(self, alert: State, body: int) -> Bools:
         bodies = np.arange(alert.vehicles + 1)
@@ -77,7 +81,8 @@ class ReportErrors(ScenarioPart):
     )  # fmt: skip
     bias_mps: float = Field(default=0.0, ge=-MOST_MPS, le=MOST_MPS, description="constant error of reported speeds")
     liar: str = Field(
-        default="vehicle_0", description="vehicle that reports no acceleration and no intent, whatever it does"
+        default="vehicle_0",
+        description="vehicle that reports no acceleration, no intent and a plan of coasting, whatever it does",
     )
 
     @model_validator(mode="after")
