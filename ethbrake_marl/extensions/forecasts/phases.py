@@ -59,8 +59,8 @@ class Forecast(NamedTuple):
 
 
 def empty_forecast(n: int, M: int, bodies: int) -> Forecast:
-    rows = LINE_ROWS, CAR_ROWS, PHASES, PHASES - 1
-    return Forecast(*(np.zeros((n, M, count, bodies)) for count in rows), np.full((n, M), 1.0 / M), np.zeros((n, 2)))
+    line, car, commands, ends = (np.zeros((n, M, rows, bodies)) for rows in (LINE_ROWS, CAR_ROWS, PHASES, PHASES - 1))
+    return Forecast(line, car, commands, ends, np.full((n, M), 1.0 / M), np.zeros((n, 2)))
 
 
 @large
@@ -243,8 +243,9 @@ def plan_worlds(car, clock, moving, plans, begun_s, forecast, settings, count, w
     Returns the number of a world in which a forecast failed, or -1. ``car``, ``clock``: as in ``State``. ``moving``
     [n]: whether body i moves. ``begun_s`` [n]: when it began to brake (s after the alert). ``settings``: body i,
     phases, team (body i first), time between decisions (s), and reaction time of the vehicle behind (s; 0: it is
-    foreseen as others are). ``count``: candidates. ``weights``: of the cost. ``costs`` [n, COSTS]: forecast cost of the
-    plan, of full braking and of the best constant, and the actions between which constants are as good.
+    foreseen as others are). ``count``: candidates (``FIRST_PLAN``). ``weights``: of the cost. ``costs`` [n, COSTS]:
+    forecast cost of the plan, of full braking and of the best constant, and the actions between which constants are as
+    good.
     """
     i, phases, team, step_s, reaction_s = settings
     x, rest, tops, worth = arrays

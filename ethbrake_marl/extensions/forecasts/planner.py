@@ -53,38 +53,62 @@ class Planner(Observer):
         return PlanMemory(np.full((alert.n, PLAN_NUMBERS), np.nan), np.full(alert.n, np.inf))
 
     def act(self, state: State, memory: PlanMemory, body: int) -> tuple[Floats, PlanMemory]:
-        force, begun_s = state.line[:, FORCE, body], memory.begun_s
+        force, begun_s, last = state.line[:, FORCE, body], memory.begun_s, no_plans(state)
         begun_s = np.where(np.isinf(begun_s) & (force < -BRAKES_MPS2), state.time_s, begun_s)
-        plan, _ = self.plan(state, self.foresee(state, body), memory.plan, begun_s, body)
-        return plan[:, COMMANDS.start].copy(), PlanMemory(plan, begun_s)
-
-    def foresee(self, state: State, body: int) -> Forecast:
-        seen = self.predictable(state, body)
-        require(seen, "a plan", SHOWN)
-        forecast = empty_forecast(state.n, 1, state.vehicles + 1)
-        plans = seen.memories.get(PLANS_KEY)
-        if plans is None:
-            plans = np.full((state.n, PLAN_NUMBERS, state.vehicles + 1), np.nan)
-        foresee_worlds(seen.line.copy(), seen.car.copy(), seen.clock.copy(), seen.know.copy(), plans, body, forecast)
-        return forecast
-
-    def plan(self, state: State, forecast: Forecast, last: Floats, begun_s: Floats, body: int) -> tuple[Floats, Floats]:
-        """New plans [n, PLAN_NUMBERS] and their ``costs`` (``plan_worlds``); ``last``: the last plans.
-
-        Raises ``PhysicsError`` if a forecast fails.
-        """
-        bodies, team = state.vehicles + 1, np.array([body])
-        plans, costs = np.full((state.n, PLAN_NUMBERS, bodies), np.nan), np.zeros((state.n, COSTS))
-        plans[:, :, body] = last
-        settings = body, self.phases, team, self.time_step_s, self.reaction_s
-        memory, arrays = working_memory(bodies, self.phases, len(team))
-        failed = plan_worlds(
-            state.car.copy(), state.clock.copy(), state.line[:, SPEED, body] != 0.0, plans, begun_s, forecast, settings,
-            self.candidates, self.harm_count.weights, memory, arrays, costs,
+        last[:, :, body] = memory.plan
+        plans, _ = make_plans(
+            state, foresee(self.predictable(state, body), body), last, begun_s, body,
+            time_step_s=self.time_step_s, phases=self.phases, reaction_s=self.reaction_s, count=self.harm_count,
+            candidates=self.candidates,
         )  # fmt: skip
-        if failed >= 0:
-            raise PhysicsError({failed: f"the forecast of a plan failed before the end of its {FORECAST_S:g} s"})
-        return plans[:, :, body], costs
+        return plans[:, COMMANDS.start, body].copy(), PlanMemory(plans[:, :, body], begun_s)
+
+
+def no_plans(state: State) -> Floats:
+    return np.full((state.n, PLAN_NUMBERS, state.vehicles + 1), np.nan)
+
+
+def writable(*arrays: Floats) -> list[Floats]:
+    """The arrays as kernels need them, which are compiled again for others."""
+    return [np.require(array, requirements=("C", "W")) for array in arrays]
+
+
+def foresee(seen: State, body: int) -> Forecast:
+    """The line that a vehicle can predict from what it has ``seen``."""
+    require(seen, "a plan", SHOWN)
+    forecast, plans = empty_forecast(seen.n, 1, seen.vehicles + 1), seen.memories.get(PLANS_KEY, no_plans(seen))
+    line, car, clock, know, plans = writable(seen.line, seen.car, seen.clock, seen.know, plans)
+    foresee_worlds(line, car, clock, know, plans, body, forecast)
+    return forecast
+
+
+def make_plans(
+    state: State,
+    forecast: Forecast,
+    last: Floats,
+    begun_s: Floats,
+    body: int,
+    *,
+    time_step_s: float,
+    phases: int,
+    reaction_s: float,
+    count: HarmCount,
+    candidates: int,
+) -> tuple[Floats, Floats]:
+    """New plans of a vehicle, [n, PLAN_NUMBERS, N + 1], and their costs (``plan_worlds``); ``last``: its last plans.
+
+    Raises ``PhysicsError`` if a forecast fails.
+    """
+    plans, costs, team = last.copy(), np.zeros((state.n, COSTS)), np.array([body])
+    (car, clock), moving = writable(state.car, state.clock), state.line[:, SPEED, body] != 0.0
+    settings = body, phases, team, time_step_s, reaction_s
+    memory, arrays = working_memory(state.vehicles + 1, phases, len(team))
+    failed = plan_worlds(
+        car, clock, moving, plans, begun_s.copy(), forecast, settings, candidates, count.weights, memory, arrays, costs
+    )
+    if failed >= 0:
+        raise PhysicsError({failed: f"the forecast of a plan failed before the end of its {FORECAST_S:g} s"})
+    return plans, costs
 
 
 def make_planner(argument: str | None, settings: Any) -> Planner:
