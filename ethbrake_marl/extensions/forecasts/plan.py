@@ -53,7 +53,7 @@ def _plans(state: State, observers: Ints, time_step_s: float) -> Floats:
             state, foresee(state, body), no_plans(state), np.full(state.n, np.inf), body,
             time_step_s=time_step_s, phases=PHASES, reaction_s=0.0, count=HONEST, candidates=CANDIDATES,
         )  # fmt: skip
-        plan = plans[:, :, body]
+        plan = np.where(np.isnan(plans[:, :, body]), 0.0, plans[:, :, body])  # an episode has ended
         actions = [actions_of(state, body, command) for command in plan[:, COMMANDS].T]
         changes = np.clip(plan[:, CHANGES] - state.time_s[:, np.newaxis], 0.0, LONGEST_S)
         speeds = np.sqrt(costs[:, list(COSTS)])
