@@ -1,119 +1,174 @@
-"""Train the shipped `universal`: one policy for any vehicle of any line.
+"""Rules in many lines: every shipped scenario, lines of 2 to 8 vehicles with each place as the learner, and others.
 
-    python docs/studies/lines.py runs/lines --seed 0
+    python docs/studies/lines.py
 
-First the recipe `three-tests` trains a policy on the paper's three tests, in runs/lines/three-tests (ten minutes of
-processor time). Then the recipe `universal` trains a network that begins as this policy in the range of its training,
-and as the plan elsewhere, on the tests and 33 other lines, in runs/lines/universal (35 minutes). The shipped policy is
-the last one, runs/lines/universal/policy-last. The same command resumes a training that was stopped.
-
-The values of every line are drawn from ranges that contain those of most shipped scenarios; nothing else is taken from
-them.
+Writes docs/results/lines.csv, and prints what the pages say of it. All costs are honest costs, means of ``WORLDS``
+worlds of each line. The least known cost comes from a search that starts from the commands of the rules. Lines whose
+rows are equal are one row. In the column `told`, learners tell their plans.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import make_teams
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.progress import Progress
-from ethbrake_marl.training.job import Job
-from ethbrake_marl.training.training import Training
-from ethbrake_marl.training.training_range import record_ranges
+from ethbrake_marl.extensions.search.best_harm import search_list
 
-RANGE_WORLDS, RANGE_SEED = 4_000, 1007  # worlds that give the range of the first policy
-TESTS = {"paper-random": 8.0, "paper-random-brake-only": 4.0, "paper-random-obstacle": 8.0}  # weights
-
-
-def uniform(low: float, high: float) -> dict[str, Any]:
-    return {"uniform": [low, high]}
-
-
-NEAR = {
-    "braking_capacity_mps2": uniform(5.5, 7.5), "driving_capacity_mps2": uniform(0, 8), "mass_t": uniform(4, 7),
-    "gaps_m": uniform(4, 12), "line_speed_mps": uniform(16, 25), "speed_deviations_mps": uniform(-2, 2),
-    "restitution": uniform(0, 0.2),
-}  # fmt: skip
-WIDE = {
-    "braking_capacity_mps2": uniform(4, 9), "driving_capacity_mps2": uniform(0, 8), "mass_t": {"loguniform": [1.2, 12]},
-    "time_gaps_s": {"loguniform": [0.2, 1.5]}, "line_speed_mps": uniform(10, 34),
-    "speed_deviations_mps": uniform(-2, 2), "restitution": uniform(0, 0.3), "horizon_s": 12,
-}  # fmt: skip
-CLOSE, ANY = {"obstacle_margin_m": uniform(0.5, 4)}, {"obstacle_margin_m": uniform(0.5, 14)}  # obstacles
-FAR = {"obstacle_margin_m": uniform(4, 20)}
-SLOW_BRAKES = {"brake_rate_mps3": uniform(8, 25), "release_rate_mps3": uniform(8, 25)}
+RULES = ("full_brake", "e_v2x_bm", "plan:1", "plan")
+WORLDS, SEED = 300, 96_001
+BUDGET = 1000  # candidates of the search in each world
+LONGEST = 8
+TABLE = Path(__file__).parents[1] / "results" / "lines.csv"
+NO_COST = 0.1  # best known costs below this (m2/s2) have no ratio
+MORE, MORE_COST = 1.02, 0.05  # a rule is worse if its cost is above another's by this factor, and this cost (m2/s2)
+TOLD = ("place", "speed", "acceleration", "braking_capacity", "latency", "mass", "plan")
 
 
-def trucks(*places: int) -> dict[str, Any]:
-    """A line of three cars with trucks at these places."""
-    pairs = [
-        (uniform(10, 40), uniform(4, 6.5)) if i in places else (uniform(1.2, 2.5), uniform(5, 9)) for i in (1, 2, 3)
-    ]
-    return {"mass_t": [mass for mass, _ in pairs], "braking_capacity_mps2": [capacity for _, capacity in pairs]}
+def line(vehicles: int, *learners: int, **more: Any) -> eb.Scenario:
+    """A line with the vehicles of the paper's test, repeated. Vehicle 1 learns only with an obstacle ahead."""
+    roles = {f"vehicle_{i}": "learner" if i in learners else "full_brake" for i in range(1, vehicles + 1)}
+    repeated = {"braking_capacity_mps2": (6, 7), "driving_capacity_mps2": (6, 7), "mass_t": (4.5, 5.5, 5.9)}
+    content = {
+        "name": "line", "vehicles": vehicles, "roles": roles, "early_impacts": "keep", "speed_limit_mps": 40,
+        "gaps_m": {"uniform": [5, 10]}, "speeds_mps": {"uniform": [18, 22]}, "restitution": 0.1,
+        "latency_s": [0, *[0.5, 0.8] * 4][:vehicles],
+        **{key: [values[i % len(values)] for i in range(vehicles)] for key, values in repeated.items()},
+        **({"obstacle_gap_m": {"uniform": [38, 55]}} if 1 in learners else {}),
+    }  # fmt: skip
+    return eb.load_scenario({**content, **more})
 
 
-# weight, quantities, number of vehicles, learners, changed quantities
-LINES: dict[str, tuple[float, dict[str, Any], int, list[int], dict[str, Any]]] = {
-    "near-2-of-3": (2, NEAR, 3, [2], {}), "near-2-of-3-obstacle": (2, NEAR, 3, [2], CLOSE),
-    "near-2-of-3-far-obstacle": (1.5, NEAR, 3, [2], FAR), "near-2-of-5": (2, NEAR, 5, [2], {}),
-    "near-3-of-5-far": (1, NEAR, 5, [3], {"gaps_m": uniform(6, 14)}),
-    "near-2-of-2": (0.5, NEAR, 2, [2], {}), "near-1-of-2": (0.5, NEAR, 2, [1], ANY),
-    "near-3-of-3": (0.5, NEAR, 3, [3], {}), "near-1-of-3": (1, NEAR, 3, [1], ANY),
-    "near-2-of-4": (1, NEAR, 4, [2], {}), "near-3-of-4-obstacle": (1, NEAR, 4, [3], CLOSE),
-    "near-3-of-5": (1, NEAR, 5, [3], {}), "near-5-of-6": (0.5, NEAR, 6, [5], {}),
-    "near-4-of-8": (0.5, NEAR, 8, [4], {}), "near-pair-of-3": (1.2, NEAR, 3, [2, 3], {}),
-    "near-all-of-3": (0.8, NEAR, 3, [1, 2, 3], ANY), "near-2-and-3-of-4-obstacle": (0.6, NEAR, 4, [2, 3], CLOSE),
-    "near-followers-of-5": (0.4, NEAR, 5, [2, 3, 4, 5], {}), "near-all-of-5": (0.3, NEAR, 5, [1, 2, 3, 4, 5], ANY),
-    "near-followers-of-8": (0.2, NEAR, 8, [2, 3, 4, 5, 6, 7, 8], {}),
-    "wide-2-of-3": (1.5, WIDE, 3, [2], {}), "wide-2-of-3-obstacle": (0.5, WIDE, 3, [2], ANY),
-    "wide-pair-of-4": (1, WIDE, 4, [2, 3], {}),
-    "truck-behind": (1, NEAR, 3, [2], trucks(3)), "truck-build-up": (1, NEAR, 3, [2], trucks(3) | SLOW_BRAKES),
-    "truck": (0.5, NEAR, 3, [2], trucks(2)),
-    "build-up": (1, NEAR, 3, [2], SLOW_BRAKES), "build-up-pair-of-4": (0.5, NEAR, 4, [2, 3], SLOW_BRAKES),
-    "slippery": (0.5, NEAR, 3, [2], {"friction": uniform(0.2, 0.7), "horizon_s": 16}),
-    "nominal-pair": (0.5, NEAR, 3, [2, 3], {"v2x": "nominal"}),
-    "congested-followers-of-4": (0.5, NEAR, 4, [2, 3, 4], {"v2x": "congested"}),
-    "front": (1, NEAR, 3, [2], {"v2x": {"preset": "paper", "hears": "front"}}),
-    "blocked": (0.5, NEAR, 3, [2], {"v2x": "sensors-only"}),
-}  # fmt: skip
+def other_lines() -> dict[str, eb.Scenario]:
+    """Lines that are no shipped scenarios: other numbers and places of learners, messages, quantities."""
+    named = {f"{place} of {vehicles}": line(vehicles, place) for vehicles, place in places()}
+    for place in [(3, 1, 2), (3, 2, 3), (4, 2, 3), (5, 2, 4)]:
+        named[":".join(map(str, place))] = line(*place)
+    for preset in ("clear", "nominal", "congested", "sensors-only"):
+        named[preset] = line(3, 2, v2x=preset)
+    changes: dict[str, dict[str, Any]] = {
+        "near": {"gaps_m": {"uniform": [2, 5]}}, "far": {"gaps_m": {"uniform": [10, 20]}},
+        "slow": {"speeds_mps": {"uniform": [9, 13]}}, "fast": {"speeds_mps": {"uniform": [26, 34]}},
+        "elastic": {"restitution": 0.4}, "heavy rear": {"mass_t": [4.5, 5.5, 18]}, "heavy own": {"mass_t": [4, 15, 6]},
+        "44 t behind": {"mass_t": [1.5, 1.5, 44], "braking_capacity_mps2": [8, 8, 5]},
+        "late": {"latency_s": [0, 0.8, 1.2]}, "early": {"latency_s": [0, 0.2, 0.4]},
+        "weak rear": {"braking_capacity_mps2": [6, 7, 4.5]}, "strong": {"braking_capacity_mps2": [8, 8, 8]},
+        "build-up": {"brake_rate_mps3": 15, "release_rate_mps3": 15}, "rare decisions": {"time_step_s": 0.5},
+    }  # fmt: skip
+    named |= {name: line(3, 2, **change) for name, change in changes.items()}
+    for place in ((3, 2), (3, 3), (4, 2), (5, 3)):
+        for name, key, ends in (("near", "obstacle_margin_m", [1, 8]), ("far", "obstacle_gap_m", [38, 55])):
+            named[f"{':'.join(map(str, place))}, {name} obstacle"] = line(*place, **{key: {"uniform": ends}})
+    return named
 
 
-def mixture() -> eb.Scenario:
-    """The paper's three tests, and the lines of ``LINES``."""
-    members: list[dict[str, Any]] = [
-        {"scenario": eb.load_scenario(name).declared(), "weight": weight} for name, weight in TESTS.items()
-    ]
-    for name, (weight, quantities, vehicles, learners, changes) in LINES.items():
-        roles = {"vehicle_1": "full_brake", **{f"vehicle_{i}": "learner" for i in learners}}
-        late = uniform(0 if quantities is WIDE else 0.2, 1.2)
-        line = {"name": name, "vehicles": vehicles, "roles": roles, "latency_s": [0, *[late] * (vehicles - 1)]}
-        members.append({"scenario": {**line, **quantities, **changes}, "weight": weight})
-    return eb.load_scenario({"name": "lines", "mixture": members})
+def places() -> Iterator[tuple[int, int]]:
+    for vehicles in range(2, LONGEST + 1):
+        for place in range(1, vehicles + 1):
+            yield vehicles, place
 
 
-def train(recipe: str, scenario: eb.Scenario, folder: Path, **changes: Any) -> None:
-    """Train in ``folder``, or resume a training there. Ctrl-C ends the program after the current update."""
-    if not Job(Training.of(recipe, scenario, **changes), folder).finish(Progress.listener("show")):
-        raise SystemExit(f"stopped; the same command resumes {folder}")
+def shipped_lines() -> dict[str, eb.Scenario]:
+    """Shipped scenarios with learners and exact impacts."""
+    loaded = [eb.load_scenario(entry.name) for entry in eb.list_scenarios()]
+    return {scenario.name: scenario for scenario in loaded if scenario.learners and scenario.physics is None}
 
 
-def train_both(folder: Path, seed: int) -> None:
-    tests, first = eb.load_scenario("mixture-three-tests"), folder / "three-tests"
-    train("three-tests", tests, first, seed=seed)
-    policies = record_ranges({"vehicle_2": eb.load_policy(first)}, tests, RANGE_WORLDS, RANGE_SEED)
-    policies["vehicle_2"].save(folder / "start", replace=True)
-    train("universal", mixture(), folder / "universal", seed=seed, start=f"policy@{folder / 'start'}")
+def least_known(scenario: eb.Scenario) -> float:
+    teams = make_teams(RULES, scenario).values()
+    worlds = scenario.sample(WORLDS, SEED)
+    found = search_list(eb.open_game(scenario)[1], worlds, harm_counts=("honest",), budget=BUDGET, teams=teams, threads=1)
+    return float(found.harm["honest"].mean())
+
+
+def told_cost(scenario: eb.Scenario) -> float:
+    """Cost of `plan` if the learners tell their plans; NaN for one learner, and where messages lack a piece."""
+    channel = scenario.v2x.model_dump(exclude_none=True)
+    if len(scenario.learners) == 1 or "tells" in channel:
+        return float("nan")
+    telling = scenario.replace(v2x={**channel, "tells": list(TOLD)})
+    result = eb.evaluate(telling, "plan", episodes=WORLDS, seed=SEED, measures="")
+    return float(result["plan"]["honest_cost"].mean())
+
+
+def row_of(scenario: eb.Scenario) -> dict[str, Any]:
+    result = eb.evaluate(scenario, RULES, episodes=WORLDS, seed=SEED, measures="pushed_mps,drove_towards")
+    means = {rule: {name: float(v.mean()) for name, v in result[rule].items() if v.dtype.kind in "bfi"} for rule in RULES}
+    full, plan = result["full_brake"]["honest_cost"], result["plan"]["honest_cost"]
+    costs = {rule: means[rule]["honest_cost"] for rule in RULES}
+    told = told_cost(scenario)
+    least = min(least_known(scenario), *costs.values(), *([told] if told == told else []))
+    possible = costs["full_brake"] - least
+    harms = [f"total_harm_{body}" for body in scenario.learners]
+    return {
+        "learners": " ".join(map(str, scenario.learners)), "hidden": float(result.worlds["hidden"].mean()), **costs,
+        "told": told, "best_known": least,
+        "share_of_possible": (costs["full_brake"] - costs["plan"]) / possible if possible > NO_COST else float("nan"),
+        "worse_than_braking": float((plan > full + 1.0).mean()),
+        "worst_5_percent": float(np.sort(plan)[-max(len(plan) // 20, 1) :].mean()),
+        "push_mps": means["plan"]["pushed_mps"], "drives": means["plan"]["drove_towards"],
+        "more_own_harm": max(means["plan"][harm] - means["full_brake"][harm] for harm in harms),
+    }  # fmt: skip
+
+
+def table() -> dict[str, dict[str, Any]]:
+    rows: dict[str, dict[str, Any]] = {}
+    for name, scenario in {**shipped_lines(), **other_lines()}.items():
+        row = row_of(scenario)
+        same = [known for known in rows if str(rows[known]) == str(row)]
+        rows = {**{known: rows[known] for known in rows if known not in same}, " = ".join([*same, name]): row}
+        print(name, {key: round(cell, 3) if isinstance(cell, float) else cell for key, cell in row.items()}, flush=True)
+    return rows
+
+
+def is_worse(cost: float, limit: float) -> bool:
+    return cost > MORE * limit + MORE_COST
+
+
+def summarise(rows: dict[str, dict[str, Any]]) -> None:
+    groups = {
+        "one learner that hears": [name for name, row in rows.items() if not row["hidden"] and " " not in row["learners"]],
+        "several learners": [name for name, row in rows.items() if not row["hidden"] and " " in row["learners"]],
+        "hidden values": [name for name, row in rows.items() if row["hidden"]],
+    }
+    for group, names in groups.items():
+        better = ("full_brake", "plan:1") if group == "hidden values" else ("full_brake", "e_v2x_bm")
+        for column in ("plan", *(["told"] if group == "several learners" else [])):
+            known = {name: row for name, row in rows.items() if name in names and row[column] == row[column]}
+            worse = [name for name, row in known.items() if is_worse(row[column], min(row[rule] for rule in better))]
+            won = [name for name, row in known.items() if row["best_known"] > NO_COST and row["share_of_possible"] > 0.0]
+            ratios = {name: known[name][column] / known[name]["best_known"] for name in won}
+            worst = max(ratios, key=lambda name: ratios[name])
+            print(
+                f"{group}, {column}: {len(known)} lines; worse than the better of {' and '.join(better)}: {worse or 'none'};"
+                f" cost / best known in {len(won)}: median {np.median([*ratios.values()]):.3f}, most {ratios[worst]:.3f} ({worst})"
+            )
+    for column in ("worse_than_braking", "push_mps", "drives", "more_own_harm"):
+        most = sorted(rows, key=lambda name: -rows[name][column])[:5]
+        print(f"{column}: {', '.join(f'{name} {rows[name][column]:.3f}' for name in most)}")
+
+
+def main() -> None:
+    rows = table()
+    with TABLE.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["line", *next(iter(rows.values()))])
+        for name, row in rows.items():
+            writer.writerow([name, *(f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row.values())])
+    summarise(rows)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="folder of both trainings")
-    parser.add_argument("--seed", type=int, default=0, help="seed of both trainings")
-    given = parser.parse_args()
+    parser.parse_args()
     try:
-        train_both(given.folder, given.seed)
+        main()
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
