@@ -84,7 +84,9 @@ def shipped_lines() -> dict[str, eb.Scenario]:
 def least_known(scenario: eb.Scenario) -> float:
     teams = make_teams(RULES, scenario).values()
     worlds = scenario.sample(WORLDS, SEED)
-    found = search_list(eb.open_game(scenario)[1], worlds, harm_counts=("honest",), budget=BUDGET, teams=teams, threads=1)
+    found = search_list(
+        eb.open_game(scenario)[1], worlds, harm_counts=("honest",), budget=BUDGET, teams=teams, threads=1
+    )
     return float(found.harm["honest"].mean())
 
 
@@ -100,7 +102,9 @@ def told_cost(scenario: eb.Scenario) -> float:
 
 def row_of(scenario: eb.Scenario) -> dict[str, Any]:
     result = eb.evaluate(scenario, RULES, episodes=WORLDS, seed=SEED, measures="pushed_mps,drove_towards")
-    means = {rule: {name: float(v.mean()) for name, v in result[rule].items() if v.dtype.kind in "bfi"} for rule in RULES}
+    means = {
+        rule: {name: float(v.mean()) for name, v in result[rule].items() if v.dtype.kind in "bfi"} for rule in RULES
+    }
     full, plan = result["full_brake"]["honest_cost"], result["plan"]["honest_cost"]
     costs = {rule: means[rule]["honest_cost"] for rule in RULES}
     told = told_cost(scenario)
@@ -134,7 +138,9 @@ def is_worse(cost: float, limit: float) -> bool:
 
 def summarise(rows: dict[str, dict[str, Any]]) -> None:
     groups = {
-        "one learner that hears": [name for name, row in rows.items() if not row["hidden"] and " " not in row["learners"]],
+        "one learner that hears": [
+            name for name, row in rows.items() if not row["hidden"] and " " not in row["learners"]
+        ],
         "several learners": [name for name, row in rows.items() if not row["hidden"] and " " in row["learners"]],
         "hidden values": [name for name, row in rows.items() if row["hidden"]],
     }
@@ -143,7 +149,9 @@ def summarise(rows: dict[str, dict[str, Any]]) -> None:
         for column in ("plan", *(["told"] if group == "several learners" else [])):
             known = {name: row for name, row in rows.items() if name in names and row[column] == row[column]}
             worse = [name for name, row in known.items() if is_worse(row[column], min(row[rule] for rule in better))]
-            won = [name for name, row in known.items() if row["best_known"] > NO_COST and row["share_of_possible"] > 0.0]
+            won = [
+                name for name, row in known.items() if row["best_known"] > NO_COST and row["share_of_possible"] > 0.0
+            ]
             ratios = {name: known[name][column] / known[name]["best_known"] for name in won}
             worst = max(ratios, key=lambda name: ratios[name])
             print(

@@ -98,8 +98,8 @@ class EstimatingPlanner(Observer):
         last = no_plans(state)
         last[:, :, body] = memory.plan
         plans, _ = make_plans(
-            state, forecast, last, np.full(n, np.inf), body, time_step_s=self.scenario.time_step_s, phases=PHASES,
-            reaction_s=0.0, count=self.harm_count, candidates=self.candidates,
+            state, forecast, last, np.full(n, np.inf), np.array([body]), phases=PHASES, reaction_s=0.0,
+            time_step_s=self.scenario.time_step_s, count=self.harm_count, candidates=self.candidates,
         )  # fmt: skip
         memory = memory_of(plans[:, :, body], lines, weight, state.time_s.copy())
         return plans[:, COMMANDS.start, body].copy(), memory
