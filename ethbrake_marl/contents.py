@@ -9,7 +9,6 @@ CONTENTS = {
         "team": "agents.trained:TEAM",
         "ppo": "agents.trained:PPO",
         "sac": "agents.trained:SAC",
-        "universal": "agents.trained:UNIVERSAL",
         "vine-paper": "agents.trained:VINE_PAPER",
         "vine-preference": "agents.trained:VINE_PREFERENCE",
         "e_v2x_bm": "agents.e_v2x_bm:E_V2X_BM",

@@ -117,8 +117,8 @@ def test_start__version_every_help_and_completion_import_nothing_heavy() -> None
         ),
         (
             "run_command(['scenario', 'show', 'paper-random'])",
-            "worlds.catalogue import load_scenario as load; name = 'universal+step'",
-            "'universal' names another kind: agent",
+            "worlds.catalogue import load_scenario as load; name = 'vine-paper+step'",
+            "'vine-paper' names another kind: agent",
         ),
     ],
 )

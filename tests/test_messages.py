@@ -69,7 +69,7 @@ def test_whole_number__is_in_its_range_and_no_truth_value(value: object) -> None
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: eb.evaluate("universal+step", "paper-random"), "'universal' names another kind: agent, recipe"),
+        (lambda: eb.evaluate("ppo+step", "paper-random"), "'ppo' names another kind: agent, algorithm"),
         (lambda: eb.make_agent("step"), "'step' names another kind: shield or search"),
         (lambda: eb.evaluate(measures="pushed", episodes=1), "did you mean 'pushed_m' or 'pushed_mps'?"),
         (lambda: eb.load_scenario("level-0-sensor"), "did you mean 'level-0-sensors'?"),

@@ -1,17 +1,16 @@
-"""Where the shipped policies are at home: their training ranges, the rule of the warning, and `universal` everywhere.
+"""Where agents are at home: the rule of the warning of policies outside their training, and `plan` in every line.
 
-    python docs/studies/competence.py record
-    python docs/studies/competence.py rule runs/lines/start
-    python docs/studies/competence.py warning runs/lines/start
+    python docs/studies/competence.py rule runs/three-tests
+    python docs/studies/competence.py warning runs/three-tests
     python docs/studies/competence.py search
     python docs/studies/competence.py table
 
-``record`` writes the range of each shipped policy into its bundle. ``rule`` counts, for several rules, in how many
-lines the rule is right that a policy is worse than a rule-based agent; no line is a shipped scenario. ``warning``
-judges the chosen rule in the shipped scenarios. Both are for the policy of the three tests only, which is bad in many
-lines. ``table`` writes docs/results/lines.csv, which compares agents in every shipped scenario, and in lines of 2 to 8
-vehicles with each position as the learner. ``search`` adds the best known costs of lines that competence.json lacks.
-All costs are honest costs, means of ``WORLDS`` worlds.
+``rule`` counts, for several rules, in how many lines the rule is right that a policy is worse than a rule-based agent;
+no line is a shipped scenario. ``warning`` judges the chosen rule in the shipped scenarios. Both are for a policy of the
+recipe ``three-tests`` only, which is bad in many lines. ``table`` writes docs/results/lines.csv, which compares agents
+in every shipped scenario, in lines of 2 to 8 vehicles with each position as the learner, and in 39 others, and prints
+the table of docs/findings.md. ``search`` adds the best known costs of lines that competence.json lacks. All costs are honest costs,
+means of ``WORLDS`` worlds.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,35 +30,21 @@ from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.evaluation.summary import OUTSIDE_SHARE
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.policies import training_range
-from ethbrake_marl.policies.bundle import load_named_policy, load_shipped, shipped_policies
-from ethbrake_marl.training.training_range import record_ranges
+from ethbrake_marl.policies.bundle import load_named_policy
 
-POLICY, FALLBACK = "universal", "plan.action"
-RECORDED_WORLDS, RECORDED_SEED = 4_000, 1007  # the seed is for bundles without a fixed list
 WORLDS, SEED, LINES_SEED = 300, 96_001, 96_002
 RULES = ((2, 0.0), (2, 0.05), (3, 0.0), (3, 0.05), (4, 0.0), (4, 0.05))  # features outside, margin
-AGENTS = {name: name for name in ("full_brake", "e_v2x_bm", "plan")}
-LEARNED = (POLICY, f"{POLICY}+step")
+CONSTANT = "plan:1"
+RIVALS = ("full_brake", "e_v2x_bm", CONSTANT)
+AGENT = "plan"
 LONGEST = 8
 BUDGET = 1000  # candidates in each world
 BEST = Path(__file__).with_suffix(".json")  # line -> best known honest cost
 TABLE = Path(__file__).parents[1] / "results" / "lines.csv"
-NO_COST = 0.1  # best known costs below this (m2/s2) have no ratio
+NO_COST, NO_GAIN = 0.1, 1.01  # best known costs below this (m2/s2), or by less than this factor below full braking's
 MORE, MORE_COST = 1.02, 0.05  # an agent is worse if its cost is above the other's by this factor, and this cost (m2/s2)
-
-
-def record() -> None:
-    from lines import mixture  # beside this file
-
-    for name, folder in shipped_policies().items():
-        policy = load_shipped(name)
-        manifest = policy.manifest
-        ranged = record_ranges(
-            dict.fromkeys(manifest.learners, policy),
-            mixture() if name == POLICY else str(manifest.scenario["name"]),
-            RECORDED_WORLDS, manifest.seeds.get("evaluation", RECORDED_SEED), FALLBACK if name == POLICY else "",
-        )  # fmt: skip
-        next(iter(ranged.values())).save(folder / "policy", replace=True)
+TOLD = ["place", "speed", "acceleration", "braking_capacity", "latency", "mass", "plan"]
+GROUPS = ("one learner", "several learners", "the channel hides values")
 
 
 def line(vehicles: int, *learners: int, **more: Any) -> eb.Scenario:
@@ -99,31 +84,19 @@ def lines() -> dict[str, eb.Scenario]:
 
 
 def shipped() -> dict[str, eb.Scenario]:
-    """Shipped scenarios that `universal` can drive."""
+    """Shipped scenarios with exact impacts and a learner."""
     loaded = [eb.load_scenario(entry.name) for entry in eb.list_scenarios()]
     return {scenario.name: scenario for scenario in loaded if scenario.learners and scenario.physics is None}
 
 
-def costs(scenario: eb.Scenario, agents: Any, seed: int, measures: str = "") -> dict[str, float]:
-    """Means: each agent's honest cost (``AGENT``) and numbers (``AGENT NAME``), and the share of hidden worlds."""
-    result = eb.evaluate(scenario, agents, episodes=WORLDS, seed=seed, harm_count="honest", measures=measures)
+def costs(scenario: eb.Scenario, agents: Any, seed: int) -> dict[str, float]:
+    """Means: each agent's honest cost (``AGENT``) and numbers (``AGENT NAME``)."""
+    result = eb.evaluate(scenario, agents, episodes=WORLDS, seed=seed, harm_count="honest")
     means = {agent: float(result[agent]["honest_cost"].mean()) for agent in result}
     for agent in result:
         numbers = {name: values for name, values in result[agent].items() if values.dtype.kind in "bfi"}
         means |= {f"{agent} {name}": float(values.mean()) for name, values in numbers.items()}
-    return means | {"hidden": float(result.worlds["hidden"].mean())}
-
-
-def both(name: str) -> dict[str, eb.LearnedAgent]:
-    """A policy (name of a shipped one, or path of a run), without and with its fallback."""
-    policy = load_named_policy(name)
-    known = policy.manifest.training_range
-    assert known is not None
-    fallbacks = {"alone": "", "with the plan": FALLBACK}
-    return {
-        title: eb.LearnedAgent(policy.with_range(known.model_copy(update={"fallback": fallback})), title)
-        for title, fallback in fallbacks.items()
-    }
+    return means
 
 
 def is_worse(cost: float, limit: float) -> bool:
@@ -131,30 +104,29 @@ def is_worse(cost: float, limit: float) -> bool:
 
 
 def quality(rows: Mapping[str, Mapping[str, float]]) -> str:
-    """Precision and recall of the warning: is ``alone`` worse than full braking and the plan where it is outside?"""
-    bad = {name for name, row in rows.items() if is_worse(row["alone"], min(row["full_brake"], row["plan"]))}
-    flagged = {name for name, row in rows.items() if row["alone outside"] > OUTSIDE_SHARE}
+    """Precision and recall of the warning: is the policy worse than full braking and a plan where it is outside?"""
+    bad = {name for name, row in rows.items() if is_worse(row["policy"], min(row["full_brake"], row[CONSTANT]))}
+    flagged = {name for name, row in rows.items() if row["policy outside"] > OUTSIDE_SHARE}
     good, missed = len(rows) - len(bad), ", ".join(sorted(bad - flagged)) or "none"
     return f"flags {len(flagged & bad)} of {len(bad)} bad and {len(flagged - bad)} of {good} good; misses {missed}"
 
 
+def compared(policy: str) -> dict[str, Any]:
+    """Agents by name; ``policy``: name of a shipped policy, or path of a run."""
+    return {**{name: name for name in RIVALS}, "policy": eb.LearnedAgent(load_named_policy(policy), "policy")}
+
+
 def rule(policy: str) -> None:
-    known = {name: costs(scenario, AGENTS, LINES_SEED) for name, scenario in lines().items()}
     for features, margin in RULES:
         training_range.FEATURES_OUTSIDE, training_range.MARGIN = features, margin
-        rows = {name: known[name] | costs(scenario, both(policy), LINES_SEED) for name, scenario in lines().items()}
-        ratio = np.exp(np.mean([np.log(row["with the plan"] / row["plan"]) for row in rows.values()]))
-        words = f"{features} features by {margin}: {quality(rows)}"
-        print(f"{words}; with the plan / plan, geometric mean {ratio:.3f}", flush=True)
+        rows = {name: costs(scenario, compared(policy), LINES_SEED) for name, scenario in lines().items()}
+        print(f"{features} features by {margin}: {quality(rows)}", flush=True)
 
 
 def warning(policy: str) -> None:
-    """Print how well the warning tells where a policy is bad, and where its fallback makes a difference."""
-    rows = {name: costs(scenario, AGENTS | both(policy), SEED) for name, scenario in shipped().items()}
+    """Print how well the warning tells where a policy is bad."""
+    rows = {name: costs(scenario, compared(policy), SEED) for name, scenario in shipped().items()}
     print(f"The warning {quality(rows)}.")
-    for name, row in rows.items():
-        if row["alone"] != row["with the plan"]:
-            print(f"{name}: alone {row['alone']:.2f}, with the plan {row['with the plan']:.2f}")
 
 
 def places() -> Iterator[tuple[str, eb.Scenario]]:
@@ -164,42 +136,63 @@ def places() -> Iterator[tuple[str, eb.Scenario]]:
             yield f"{place} of {vehicles}", line(vehicles, place)
 
 
+def telling() -> Iterator[tuple[str, eb.Scenario]]:
+    """Shipped lines of several learners, who also tell their plans."""
+    for name, scenario in shipped().items():
+        channel = scenario.v2x.model_dump(exclude_none=True)
+        if len(scenario.learners) > 1 and "tells" not in channel:
+            yield f"{name}, plans told", scenario.replace(v2x={**channel, "tells": TOLD})
+
+
+def every_line() -> dict[str, eb.Scenario]:
+    return {**shipped(), **dict(telling()), **dict(places()), **lines()}
+
+
 def search() -> None:
     """Search the least cost of the lines that ``BEST`` lacks, starting also from the agents' commands."""
-    costs = json.loads(BEST.read_text())
-    for name, scenario in (*shipped().items(), *places()):
-        if name not in costs:
+    known = json.loads(BEST.read_text())
+    for name, scenario in every_line().items():
+        if name not in known:
             game = open_game(scenario)[1]
-            teams = make_teams(",".join((*AGENTS, POLICY)), scenario, harm_count="honest").values()
+            teams = make_teams(",".join((*RIVALS, AGENT)), scenario, harm_count="honest").values()
             found = search_list(
                 game, scenario.sample(WORLDS, SEED), harm_counts=("honest",), budget=BUDGET, teams=teams, threads=1
             )
-            costs[name] = float(found.harm["honest"].mean())
-            BEST.write_text(json.dumps(costs, indent=1) + "\n")
-            print(name, costs[name], flush=True)
+            known[name] = float(found.harm["honest"].mean())
+            BEST.write_text(json.dumps(known, indent=1) + "\n")
+            print(name, known[name], flush=True)
 
 
 def row_of(scenario: eb.Scenario, least: float) -> dict[str, Any]:
     """Row of the table. ``least``: best known cost of a search."""
-    agents = dict.fromkeys((*AGENTS, *LEARNED))
-    means = costs(scenario, {agent: agent for agent in agents}, SEED, "pushed_mps,drove_towards")
+    result = eb.evaluate(
+        scenario, [*RIVALS, AGENT], episodes=WORLDS, seed=SEED, harm_count="honest", measures="pushed_mps,drove_towards"
+    )
+    means = {agent: {name: float(np.mean(values)) for name, values in result[agent].items()
+                     if values.dtype.kind in "bfi"} for agent in result}  # fmt: skip
+    worst = WORLDS // 20
+    braking, planned = result["full_brake"]["honest_cost"], result[AGENT]["honest_cost"]
     harms = [f"total_harm_{body}" for body in scenario.learners]
     return {
-        "learners": " ".join(map(str, scenario.learners)), "hidden": means["hidden"],
-        **{agent: means[agent] for agent in agents},
-        "best_known": min(least, *(means[agent] for agent in LEARNED)),
-        **{f"{agent}_push_mps": means[f"{agent} pushed_mps"] for agent in ("e_v2x_bm", POLICY)},
-        "drives": means[f"{POLICY} drove_towards"], "outside": means[f"{POLICY} outside"],
-        "more_own_harm": max(means[f"{POLICY} {harm}"] - means[f"full_brake {harm}"] for harm in harms),
+        "learners": " ".join(map(str, scenario.learners)), "hidden": float(result.worlds["hidden"].mean()),
+        **{agent: means[agent]["honest_cost"] for agent in result},
+        "best_known": min(least, *(means[agent]["honest_cost"] for agent in result)),
+        "over_1": float((planned > braking + 1.0).mean()),
+        "worst5": float(np.sort(planned)[-worst:].mean()), "full_brake_worst5": float(np.sort(braking)[-worst:].mean()),
+        **{f"{agent}_push_mps": means[agent]["pushed_mps"] for agent in ("e_v2x_bm", AGENT)},
+        "drives": means[AGENT]["drove_towards"],
+        "more_own_harm": max(means[AGENT][harm] - means["full_brake"][harm] for harm in harms),
     }  # fmt: skip
 
 
 def table() -> None:
-    """Write ``TABLE``, and print a summary."""
+    """Write ``TABLE``, and print the table of the page. Lines in which all agents cost the same are one line."""
     best, rows = json.loads(BEST.read_text()), {}
-    for name, scenario in (*shipped().items(), *places()):
-        rows[name] = row_of(scenario, best[name])
-        print(name, rows[name], flush=True)
+    for name, scenario in every_line().items():
+        row = row_of(scenario, best[name])
+        if not any(all(row[agent] == other[agent] for agent in (*RIVALS, AGENT)) for other in rows.values()):
+            rows[name] = row
+        print(name, row, flush=True)
     with TABLE.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["line", *next(iter(rows.values()))])
@@ -207,56 +200,62 @@ def table() -> None:
             [name, *(f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row.values())]
             for name, row in rows.items()
         )
-    groups = {
-        "one learner": [name for name, row in rows.items() if not row["hidden"] and " " not in row["learners"]],
-        "several learners": [name for name, row in rows.items() if not row["hidden"] and " " in row["learners"]],
-        "hidden values": [name for name, row in rows.items() if row["hidden"]],
-    }
-    print("| lines | number | agent | worse than the better rule | median | worst |")
-    print("| --- | ---: | --- | --- | ---: | ---: |")
-    for group, names in groups.items():
-        for agent in LEARNED:
-            rules = {name: min(rows[name][rule] for rule in rules_of(rows[name])) for name in names}
-            worse = [name for name in names if is_worse(rows[name][agent], rules[name])]
-            known = {name: rows[name]["best_known"] for name in names}
-            ratios = {name: rows[name][agent] / known[name] for name in names if known[name] >= NO_COST}
-            worst = max(ratios, key=lambda name: ratios[name])
-            words = f"{len(worse)}{': ' if worse else ''}{', '.join(worse)}"
-            middle, end = np.median([*ratios.values()]), f"{ratios[worst]:.2f} ({worst})"
-            print(f"| {group} | {len(names)} | `{agent}` | {words} | {middle:.2f} | {end} |")
-    extremes = {
-        f"more cost, best known below {NO_COST}": {
-            name: row[POLICY] - row["best_known"] for name, row in rows.items() if row["best_known"] < NO_COST
-        },
-        "push beyond E-V2X-BM's": {
-            name: row[f"{POLICY}_push_mps"] - row["e_v2x_bm_push_mps"] for name, row in rows.items()
-        },
-        "driving before contact": {name: row["drives"] for name, row in rows.items()},
-        "harm of a learner beyond full braking's": {name: row["more_own_harm"] for name, row in rows.items()},
-    }
-    for title, values in extremes.items():
-        most = sorted(values, key=lambda name: -values[name])[:5]
-        print(f"{title}: {', '.join(f'{name} {values[name]:.3f}' for name in most)}")
+    for cells in page_rows(read_table()):
+        print(f"| {' | '.join(cells)} |")
 
 
-def rules_of(row: Mapping[str, Any]) -> tuple[str, str]:
+def read_table() -> list[dict[str, str]]:
+    return list(csv.DictReader(TABLE.read_text("utf-8").splitlines()))
+
+
+def page_rows(table: Sequence[Mapping[str, str]]) -> list[list[str]]:
+    """Rows of the table in docs/findings.md."""
+    found = []
+    for group in GROUPS:
+        rows = {row["line"]: row for row in table if group_of(row) == group}
+        numbers = {
+            name: {key: float(cell) for key, cell in row.items() if key not in ("line", "learners")}
+            for name, row in rows.items()
+        }
+        worse = [name for name, row in numbers.items() if is_worse(row[AGENT], min(row[rival] for rival in known(row)))]
+        ratios = {
+            name: row[AGENT] / row["best_known"]
+            for name, row in numbers.items()
+            if row["best_known"] >= NO_COST and row["full_brake"] > NO_GAIN * row["best_known"]
+        }
+        worst, over = max(ratios, key=lambda name: ratios[name]), max(numbers, key=lambda name: numbers[name]["over_1"])
+        found.append([
+            group, str(len(rows)), f"{len(worse)}{': ' if worse else ''}{', '.join(f'`{name}`' for name in worse)}",
+            f"{np.median([*ratios.values()]):.2f}", f"{ratios[worst]:.2f} (`{worst}`)",
+            f"{100.0 * numbers[over]['over_1']:.1f} % (`{over}`)",
+        ])  # fmt: skip
+    return found
+
+
+def group_of(row: Mapping[str, str]) -> str:
+    if float(row["hidden"]):
+        return GROUPS[2]
+    return GROUPS[1] if " " in row["learners"] else GROUPS[0]
+
+
+def known(row: Mapping[str, float]) -> tuple[str, str]:
     """The rules that know what the vehicle knows."""
-    return ("full_brake", "plan" if row["hidden"] else "e_v2x_bm")
+    return ("full_brake", CONSTANT if row["hidden"] else "e_v2x_bm")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("record", "rule", "warning", "search", "table"))
+    parser.add_argument("what", choices=("rule", "warning", "search", "table"))
     parser.add_argument("policy", nargs="?", help="shipped policy or run, for rule and warning only")
     given = parser.parse_args()
     judges = {"rule": rule, "warning": warning}
     if (given.what in judges) != (given.policy is not None):
-        needs = "needs a policy, such as runs/lines/start" if given.what in judges else "takes no policy"
+        needs = "needs a policy, such as runs/three-tests" if given.what in judges else "takes no policy"
         parser.error(f"{given.what} {needs}")
     try:
         if given.what in judges:
             judges[given.what](given.policy)
         else:
-            {"record": record, "search": search, "table": table}[given.what]()
+            {"search": search, "table": table}[given.what]()
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")

@@ -19,7 +19,7 @@ EVERY = 2  # scenes from one picture to the next
 COLOURS = 32
 WORLDS = {  # scenario -> agent, world of the list of seed 7
     "paper-random": ("e_v2x_bm", 14),
-    "paper-random-obstacle": ("universal", 5),
+    "paper-random-obstacle": ("plan", 5),
     "paper-delay-high": ("full_brake", 0),
     "realistic-motorway": ("e_v2x_bm", 1),
     "realistic-mixed": ("full_brake", 0),
@@ -28,8 +28,8 @@ WORLDS = {  # scenario -> agent, world of the list of seed 7
     "stress-wide": ("full_brake", 4),
     "cooperation-2-five": ("e_v2x_bm", 0),
     "cooperation-3-five": ("full_brake", 1),
-    "cooperation-4-all": ("universal", 1),
-    "messages-noisy": ("universal", 0),
+    "cooperation-4-all": ("plan", 1),
+    "messages-noisy": ("plan", 0),
 }
 
 

@@ -74,7 +74,8 @@ def show(name: str, known: dict[str, np.ndarray], base: str) -> None:
         if label != base:
             difference = values - known[base]
             half = 1.96 * difference.std(ddof=1) / np.sqrt(len(difference))
-            text += f"   minus {base}: {difference.mean():+.3f} [{difference.mean() - half:+.3f}, {difference.mean() + half:+.3f}]"
+            low, high = difference.mean() - half, difference.mean() + half
+            text += f"   minus {base}: {difference.mean():+.3f} [{low:+.3f}, {high:+.3f}]"
         print(text, flush=True)
 
 

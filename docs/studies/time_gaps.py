@@ -19,7 +19,7 @@ from ethbrake_marl.extensions.report.style import finish, in_our_style, new_pane
 
 WORLDS, SEED = 2000, 7
 GAPS_S = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4)
-AGENTS = ("full_brake", "e_v2x_bm", "idm", "universal")
+AGENTS = ("full_brake", "e_v2x_bm", "idm", "plan")
 COUNTS = {"first": "first_impact_harm", "total": "total_harm", "honest": "honest_cost"}
 SCENARIOS = ("paper-random", "realistic-motorway")
 LEAST = 0.05  # no share is shown if the mean harm of full braking (m2/s2) is below this

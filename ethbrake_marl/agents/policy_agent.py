@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,7 +29,7 @@ from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import NUMBER, State, map_arrays
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.motion.digest import physics_digest
-from ethbrake_marl.motion.layout import Bools, Floats, Ints
+from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.manifest import PHYSICS_KEY
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.training_range import TrainingRange
@@ -96,25 +95,12 @@ class LearnedAgent(RangeObserver):
         return None if self.training_range is None else RangeMemory(np.zeros(alert.n, np.int64))
 
     def act(self, state: State, memory: RangeMemory | None, body: int) -> tuple[Floats, RangeMemory | None]:
-        fallback = "" if self.training_range is None else self.training_range.fallback
-        observations, is_known = self._observe_with_fallback(fallback, state, body)
+        observations = self.observe(self.policy.observation, state, body)
         actions = self.policy(observations)[:, 0].astype(np.float64)
-        if self.training_range is not None:
-            outside = (self.training_range.is_outside(observations) | ~is_known) & ~state.ended
-            if fallback and outside.any():
-                actions[outside] = self.observe(View([fallback]), state.take(outside), body)[:, 0]
-            memory = None if memory is None else RangeMemory(memory.outside + outside)
+        if self.training_range is not None and memory is not None:
+            outside = self.training_range.is_outside(observations) & ~state.ended
+            memory = RangeMemory(memory.outside + outside)
         return commands_of(state, body, actions), memory
-
-    def _observe_with_fallback(self, fallback: str, state: State, body: int) -> tuple[Observations, Bools]:
-        """Observations, [n, F], and whether the group of the feature ``fallback`` is known, [n].
-
-        Where it is not, the policy would act on a forecast that lacks a neighbour.
-        """
-        view, column = with_known(self.policy.observation, fallback)
-        observations = self.observe(view, state, body)
-        is_known = np.ones(state.n, np.bool_) if column is None else observations[:, column] > 0.0
-        return np.ascontiguousarray(observations[:, : len(self.policy.observation.names)]), is_known
 
     @property
     def training_range(self) -> TrainingRange | None:
@@ -129,18 +115,6 @@ class LearnedAgent(RangeObserver):
 
     def observe(self, view: View, state: State, body: int) -> Observations:
         return observe_through(self.layers, view, state, body, self.policy.manifest.time_step_s)
-
-
-@cache
-def with_known(view: View, fallback: str) -> tuple[View, int | None]:
-    """``view`` and the feature ``known`` that the function of ``fallback`` computes, and its column; None: none."""
-    groups, group = GROUPS.usable(), fallback.partition(".")[0]
-    together = [name for name in groups if group in groups and groups[name].function is groups[group].function]
-    flags = [f"{name}.known" for name in together if "known" in [feature.name for feature in groups[name].features]]
-    if not flags:
-        return view, None
-    names = list(dict.fromkeys([*view.names, flags[0]]))
-    return View(names), names.index(flags[0])
 
 
 @dataclass(frozen=True)

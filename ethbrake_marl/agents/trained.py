@@ -1,4 +1,4 @@
-"""Trained policies as agents, by name: ``universal``, ``ppo``, ``policy@PATH``, ``ppo@PATH``, ``team@RUN``."""
+"""Trained policies as agents, by name: ``vine-paper``, ``ppo``, ``policy@PATH``, ``ppo@PATH``, ``team@RUN``."""
 
 from __future__ import annotations
 
@@ -63,6 +63,5 @@ POLICY = Part(
     make_trained, form="policy@PATH", about="the policy of a run or bundle, trained by any algorithm", knows=MESSAGES
 )
 TEAM = Part(make_trained, form="team@RUN", about="the learners of a run, each with its policy", knows=MESSAGES)
-UNIVERSAL = _shipped("universal", "any vehicle of any line, honest cost")
 VINE_PAPER = _shipped("vine-paper", "paper-random, first-impact harm: it pushes")
 VINE_PREFERENCE = _shipped("vine-preference", "paper-random-preference")

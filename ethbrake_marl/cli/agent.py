@@ -38,9 +38,9 @@ def agent_list(as_json: JsonOption = False) -> None:
             out.note(f"left out: {reason}")
 
 
-@agent_group.command("show", epilog=example("agent show universal --scenario stress-wide"))
+@agent_group.command("show", epilog=example("agent show ppo --scenario stress-wide"))
 def agent_show(
-    name: Annotated[str, typer.Argument(metavar="AGENT", help="A trained policy, such as universal or policy@PATH.")],
+    name: Annotated[str, typer.Argument(metavar="AGENT", help="A trained policy, such as ppo or policy@PATH.")],
     scenario: Annotated[
         str | None, typer.Option(metavar="NAME|PATH", help="Also say how well the policy's training covers a scenario.")
     ] = None,
@@ -57,14 +57,12 @@ def agent_show(
 
         agent = make_agent(name, scenario=scenario)
         if not isinstance(agent, LearnedAgent):
-            raise InvalidInput(f"agent {name!r}: is no trained policy; name one, such as universal or policy@runs/mine")
+            raise InvalidInput(f"agent {name!r}: is no trained policy; name one, such as ppo or policy@runs/mine")
         manifest = agent.policy.manifest
         training_range = manifest.training_range
         if training_range is None:
             raise InvalidInput(f"agent {name!r}: its file does not say what it observed in training; train it again")
         text = f"{name}: {', '.join(manifest.learners)} in {manifest.scenario.get('name')}, by {manifest.algorithm}."
-        if training_range.fallback:
-            text += f" Outside the range of its training it follows {training_range.fallback}."
         if scenario is not None:
             share = float(evaluate(scenario, name, episodes=SHOWN_EPISODES)[name]["outside"].mean())
             text += f" In {scenario}, {100 * share:.0f} % of its decisions are outside."

@@ -62,17 +62,15 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
     Simulates the first 200 worlds of the evaluation list. Shows the range of each quantity in these worlds, whom each
     learner knows, and whether there is anything to learn: the harm of full braking, of the best constant deceleration,
-    and of the best known commands. A mixture of lines is tried line by line.
+    and of the best known commands.
     """
     from ethbrake_marl.cli.trial import try_scenario
     from ethbrake_marl.worlds.catalogue import load_scenario
 
     with Out(as_json=as_json) as out:
         scenario = load_scenario(path)
-        trials = [(line, try_scenario(line)) for line in scenario.lines or (scenario,)]
-        contents = [_trial_content(line, trial) for line, trial in trials]
-        words = [text for line, trial in trials for text in _trial_lines(line, trial)]
-        out.result({"name": scenario.name, "lines": contents} if scenario.lines else contents[0], *words)
+        trial = try_scenario(scenario)
+        out.result(_trial_content(scenario, trial), *_trial_lines(scenario, trial))
 
 
 def _trial_content(scenario: Scenario, trial: Trial) -> dict[str, Any]:

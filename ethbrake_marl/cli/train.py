@@ -147,7 +147,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
             columns.append(Column(shown.words.capitalize(), shown.column))
     measured[result.agent] = dict(result.metrics or {})
     if OBJECTIVE_METRIC in measured["full_brake"]:
-        columns.append(Column("Relative to full braking" if training.scenario.lines else "Objective", OBJECTIVE_METRIC))
+        columns.append(Column("Objective", OBJECTIVE_METRIC))
     rows = [(agent, *(metrics.get(column.name) for column in columns[1:])) for agent, metrics in measured.items()]
     note = (
         f"Means per world; harm in m²/s². The means are over the {plan.evaluation.worlds:,} worlds of seed"
@@ -157,9 +157,8 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     settings = read_object(result.directory / "config.json").get("settings", ())
     options = [setting for setting in settings if read_settings([setting], [*type(plan).model_fields]).scenario]
     options += [f"harm_count={count.name}"] * (count != HONEST)
-    place = training.lines[0].scenario.name if training.scenario.lines else scenario or training.scenario.name
     words = [word for file in loaded_files() for word in ("--load", file)]
-    words += ["--scenario", place, "--agents", f"full_brake,{result.agent}"]
+    words += ["--scenario", scenario or training.scenario.name, "--agents", f"full_brake,{result.agent}"]
     command = shlex.join(
         ["ethbrake", "evaluate", *words, *(word for setting in options for word in ("--set", setting))]
     )

@@ -229,8 +229,8 @@ class SummaryTable(list[SummaryRow]):
         if elsewhere:
             notes.append(
                 "Share of decisions with observations outside the range of the policy's training:"
-                f" {'; '.join(elsewhere)}. There a policy may be worse than full braking, unless it"
-                " has a fallback, as `universal` has (docs/reference/policies.md)."
+                f" {'; '.join(elsewhere)}. There a policy may be worse than full braking"
+                " (docs/reference/policies.md)."
             )
         through = [row.agent for row in self if row.sees_through]
         if through:

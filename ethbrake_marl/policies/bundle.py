@@ -85,7 +85,7 @@ def shipped_policies() -> dict[str, Path]:
 
 
 def load_shipped(name: str) -> Policy:
-    """Shipped policy with this name, such as ``universal``. Raises ``UnknownName``."""
+    """Shipped policy with this name, such as ``ppo``. Raises ``UnknownName``."""
     folders = shipped_policies()
     if name not in folders:
         raise unknown_name("shipped policy", name, folders)

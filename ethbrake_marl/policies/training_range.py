@@ -7,7 +7,6 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from ethbrake_marl.episode.features import feature_named
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.motion.layout import Bools
 from ethbrake_marl.policies.observed import FiniteModel
@@ -20,29 +19,23 @@ Ends = Annotated[tuple[float, ...], Field(min_length=1, max_length=4096)]  # [F]
 
 
 class TrainingRange(FiniteModel):
-    """Quantiles of each observed feature in the worlds of the training, and what a policy does outside."""
+    """Quantiles of each observed feature in the worlds of the training."""
 
     low: Ends
     high: Ends
-    fallback: str = Field("", exclude_if=lambda name: not name)  # feature that is the action outside; "": none
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if len(self.low) != len(self.high) or not np.less_equal(self.low, self.high).all():
             raise ValueError("low, high: must have one number for each feature, low at most high")
-        if self.fallback:
-            action = feature_named(self.fallback)
-            if (action.unit, action.scale, action.low) != ("1", 1.0, -1.0) or action.high > 1.0:
-                right = "must be an action: a feature of unit 1 and scale 1 that is from -1 to at most 1"
-                raise ValueError(f"fallback = {self.fallback}: {right}")
         return self
 
     @classmethod
-    def of(cls, observations: Observations, fallback: str = "") -> Self:
+    def of(cls, observations: Observations) -> Self:
         """Range of ``observations`` [n, F]."""
         low = np.quantile(observations, OUTER_SHARE, axis=0, method="higher")
         high = np.quantile(observations, 1.0 - OUTER_SHARE, axis=0, method="lower")
-        return cls(low=tuple(low.tolist()), high=tuple(high.tolist()), fallback=fallback)
+        return cls(low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def is_outside(self, observations: Observations) -> Bools:
         """Whether each observation is outside, [n]; ``observations`` [n, F]."""

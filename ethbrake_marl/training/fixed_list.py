@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from ethbrake_marl.agents.team import CHUNK, Agent, Team, play_to_end
 from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.training.training import Training
@@ -35,11 +34,8 @@ def drive_list(training: Training) -> Callable[[Mapping[str, Agent]], dict[str, 
     """The function takes agents (learner -> agent). Its metrics are means over the worlds: the columns of all counts of
     harm (``total_harm``), ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a
     learner's objective is not the harm of the line, there is also each learner's objective (``objective_vehicle_2``),
-    and their mean ``objective``. In a mixture of lines every line has its share of the worlds, and ``relative_NAME`` is
-    what is minimised in the line NAME divided by that of full braking; ``objective`` is its mean over the worlds.
+    and their mean ``objective``.
     """
-    if training.scenario.lines:
-        return _drive_lines(training.lines)
     plan, count = training.recipe.evaluation, training.recipe.reward.harm_count
     scenario, game = open_game(training.scenario, reward={"harm_count": count})
     worlds = scenario.sample(plan.worlds, plan.seed)
@@ -54,38 +50,6 @@ def drive_list(training: Training) -> Callable[[Mapping[str, Agent]], dict[str, 
 
 def full_braking(training: Training) -> dict[str, float]:
     return drive_list(training)(dict.fromkeys(training.learners, FULL_BRAKE))
-
-
-def braking_cost(training: Training) -> float:
-    """Mean of what the training minimises, if all learners brake fully. Raises ``InvalidInput`` if it is 0."""
-    cost = deciding(full_braking(training), training.recipe.reward.harm_count)
-    if not cost > 0.0:
-        raise InvalidInput(
-            f"scenario {training.scenario.name!r}: full braking costs nothing in the worlds of the fixed list"
-            f" ({training.recipe.evaluation.worlds}), so costs cannot be divided by it; leave the scenario out of the"
-            " mixture, or use a longer list (evaluation.worlds)"
-        )
-    return cost
-
-
-def _drive_lines(lines: Sequence[Training]) -> Callable[[Mapping[str, Agent]], dict[str, float]]:
-    parts = [(line, drive_list(line), braking_cost(line)) for line in lines]
-    worlds = np.array([line.recipe.evaluation.worlds for line in lines], float)
-
-    def drive(agents: Mapping[str, Agent]) -> dict[str, float]:
-        all_metrics, relative_costs = [], {}
-        for line, drive_line, cost in parts:
-            metrics = drive_line({name: agents[name] for name in line.learners})
-            relative = deciding(metrics, line.recipe.reward.harm_count) / cost
-            relative_costs[f"relative_{line.scenario.name}"] = relative
-            all_metrics.append({**metrics, OBJECTIVE_METRIC: relative})
-        names = [name for name in all_metrics[0] if all(name in metrics for metrics in all_metrics)]
-        columns = {name: np.array([metrics[name] for metrics in all_metrics]) for name in names}
-        return {
-            name: math.fsum(worlds * column) / math.fsum(worlds) for name, column in columns.items()
-        } | relative_costs
-
-    return drive
 
 
 def metrics_of(training: Training, last: State) -> dict[str, float]:

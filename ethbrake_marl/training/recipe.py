@@ -99,7 +99,6 @@ class TrainingRecipe(FileModel):
     """
 
     schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # schemes that the algorithm supports
-    mixes_lines: ClassVar[bool] = False  # whether the algorithm can train on a mixture of lines
 
     name: str = Field(pattern=NAME_PATTERN, description="equal to the file's name without .yaml")
     title: str = Field("", description="title in one line")

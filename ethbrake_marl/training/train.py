@@ -26,7 +26,6 @@ from ethbrake_marl.progress import Progress, ProgressOption
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.training import checkpoint
 from ethbrake_marl.training.fixed_list import Policies, PolicyMeasure, measure_on_list
-from ethbrake_marl.training.lines import LinesVecEnv
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, algorithm_of
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.training import Training, check_new_run
@@ -212,18 +211,15 @@ def _one_training() -> Iterator[Callable[[], bool]]:
         _ONE_TRAINING.release()
 
 
-def make_environment(training: Training) -> EthBrakeVecEnv | LinesVecEnv:
+def make_environment(training: Training) -> EthBrakeVecEnv:
     """One row for each learner in each world."""
-    environments = []
-    for line in training.lines:
-        recipe = line.recipe
-        scenario, game = open_game(line.scenario, reward=recipe.reward, observation=list(line.row.names))
-        appended = APPENDED.get(line.scheme)
-        environments.append(EthBrakeVecEnv(scenario, game, recipe.n_envs, recipe.seed, recipe.horizon_is_end, appended))
-    return environments[0] if len(environments) == 1 else LinesVecEnv(environments)
+    recipe = training.recipe
+    scenario, game = open_game(training.scenario, reward=recipe.reward, observation=list(training.row.names))
+    appended = APPENDED.get(training.scheme)
+    return EthBrakeVecEnv(scenario, game, recipe.n_envs, recipe.seed, recipe.horizon_is_end, appended)
 
 
-def make_model(training: Training, environment: EthBrakeVecEnv | LinesVecEnv) -> BaseAlgorithm:
+def make_model(training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
     """Raises ``InvalidInput`` for VecNormalize."""
     model: BaseAlgorithm = algorithm_of(training.recipe).build(training, environment)
     if model.get_vec_normalize_env() is not None:
@@ -277,7 +273,7 @@ def _check_unfinished(folder: RunFolder, training: Training) -> None:
     if status["status"] == "finished" or (status.get("stage") is not None and not any(folder.checkpoints.glob("*"))):
         raise InvalidInput(
             f"{folder.path}: this training has finished and cannot be resumed; evaluate its policy with: ethbrake"
-            f" evaluate --scenario {training.lines[0].scenario.name} --agents"
+            f" evaluate --scenario {training.scenario.name} --agents"
             f" full_brake,{agent_of(training, folder.path)}"
         )
 

@@ -15,7 +15,7 @@ from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.network import NetworkSpec
-from ethbrake_marl.training.recipe import ALGORITHMS, Scheme, TrainingRecipe, load_recipe
+from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
 from ethbrake_marl.worlds.open_game import AnyScenario, views_of
@@ -52,21 +52,6 @@ class Training(NamedTuple):
                 " independent"
             )
         return cls(recipe, scenario, scheme, learners, views)
-
-    @property
-    def lines(self) -> tuple[Training, ...]:
-        """The training in each line of a mixture of lines, with its share of the worlds; else the training alone."""
-        if not self.scenario.lines:
-            return (self,)
-        trainings, mixture, listed = [], self.scenario.mixture or (), self.recipe.evaluation
-        for entry in mixture:
-            share, line = entry.weight / sum(member.weight for member in mixture), entry.scenario
-            worlds = listed.model_copy(update={"worlds": max(round(share * listed.worlds), 1)})
-            changes = {"n_envs": max(round(share * self.recipe.n_envs), 1), "evaluation": worlds}
-            learners = tuple(line.vehicle_names[body - 1] for body in line.learners)
-            views = (self.row,) * len(learners)
-            trainings.append(Training(self.recipe.model_copy(update=changes), line, self.scheme, learners, views))
-        return tuple(trainings)
 
     @property
     def drivers(self) -> dict[str, str]:
@@ -136,16 +121,8 @@ class Training(NamedTuple):
 
 def _check(recipe: TrainingRecipe, scenario: Scenario, scheme: Scheme, learners: Sequence[str]) -> None:
     where = f"scenario {scenario.name!r}"
-    if scenario.lines and not recipe.mixes_lines:
-        mixing = [name for name, (model, _) in ALGORITHMS.usable().items() if model.mixes_lines]
-        raise InvalidInput(
-            f"{where}: its scenarios have different vehicles or roles, and the algorithm {recipe.algorithm} of recipe"
-            f" {recipe.name!r} trains on one line; use one of the scenarios, or another algorithm:"
-            f" {', '.join(mixing) or 'none of those installed'}"
-        )
-    silent = [line.name for line in scenario.lines or (scenario,) if not line.learners]
-    if silent:
-        raise InvalidInput(f"scenario {silent[0]!r} has no learner; give at least one vehicle the role learner")
+    if not learners:
+        raise InvalidInput(f"{where} has no learner; give at least one vehicle the role learner")
     if scheme == "single" and len(learners) > 1:
         raise InvalidInput(
             f"scheme single: {where} has {len(learners)} learners; use the scheme shared, independent or centralised,"

@@ -1,8 +1,4 @@
-"""Mixtures: each world is drawn from one of several scenarios, the *members*, chosen by weight.
-
-In a *mixture of lines* the members differ in their vehicles or roles. A training can use it, each member with its share
-of the worlds; whatever needs one batch of worlds refuses it.
-"""
+"""Mixtures: each world is drawn from one of several scenarios, the *members*, chosen by weight."""
 
 from __future__ import annotations
 
@@ -24,9 +20,8 @@ _MIXTURE_KEYS = (
     *DESCRIPTIVE_KEYS,
     "mixture",
 )  # keys of the mixture itself; every other key applies to all members
-# Members must not differ in these, except that a mixture of lines needs only those of _OF_ALL_LINES.
+# Members must not differ in these.
 _ONE_FOR_ALL = ("vehicles", "time_step_s", "horizon_s", "physics", "roles", "objective", "observation")
-_OF_ALL_LINES = ("time_step_s", "physics", "objective", "observation")
 _SHARED_KEYS = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # the mixture has them if all members agree
 
 
@@ -74,24 +69,10 @@ def with_members(content: dict[str, Any], scenario: type[Scenario]) -> dict[str,
     return {key: value for key, value in content.items() if key not in common_content} | shared | {"mixture": mixture}
 
 
-def have_different_lines(members: Sequence[Scenario]) -> bool:
-    return any((member.vehicles, member.roles) != (members[0].vehicles, members[0].roles) for member in members)
-
-
-def require_one_line(scenario: Scenario) -> None:
-    if scenario.lines:
-        names = ", ".join(member.name for member in scenario.lines)
-        raise InvalidInput(
-            f"scenario {scenario.name!r}: its scenarios have different vehicles or roles, so only a training whose"
-            f" algorithm mixes lines can use it; use one of the scenarios here: {names}"
-        )
-
-
 def _check_alike(members: Sequence[Scenario]) -> None:
     first, *later_members = members
     extended = any(member.v2x.channel_keys for member in members)
-    shared_keys = (*_ONE_FOR_ALL, "v2x") if extended else _ONE_FOR_ALL
-    keys = _OF_ALL_LINES if have_different_lines(members) else shared_keys
+    keys = (*_ONE_FOR_ALL, "v2x") if extended else _ONE_FOR_ALL
     for k, later_member in enumerate(later_members, 1):
         twice = later_member.name in [member.name for member in members[:k]]
         right = f"{later_member.name} is listed twice; list it once, with the sum of its weights"

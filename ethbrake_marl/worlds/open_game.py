@@ -17,7 +17,6 @@ from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.errors import FreeImpacts
 from ethbrake_marl.parallel import chosen_threads
-from ethbrake_marl.worlds.mixture import require_one_line
 from ethbrake_marl.worlds.physics import PHYSICS
 from ethbrake_marl.worlds.sampling import WorldPool
 from ethbrake_marl.worlds.scenario import Scenario
@@ -39,7 +38,6 @@ def game_of(
     ``scripts``: vehicle (1: Vehicle 1) -> script, for vehicles whose role is the name of an agent. Warns
     (``FreeImpacts``) if an impact costs nothing under a learner's objective.
     """
-    require_one_line(scenario)
     if observation is not None:
         current_features = {
             name: view.names for name, view in zip(scenario.vehicle_names, views_of(scenario), strict=True)

@@ -17,7 +17,6 @@ from ethbrake_marl.motion.layout import BRAKE_RATE, FAR_M, GAP, IMPACTS, LATENCY
 from ethbrake_marl.worlds.channel import PER_LINK
 from ethbrake_marl.worlds.counters import Numbers, Purpose, uniform_numbers, world_numbers
 from ethbrake_marl.worlds.derived import QuantityValues, obstacle_gap, world_values
-from ethbrake_marl.worlds.mixture import require_one_line
 from ethbrake_marl.worlds.physics import departures_by
 from ethbrake_marl.worlds.quantities import (
     CAR_QUANTITIES,
@@ -93,10 +92,7 @@ class WorldPool:
 
 
 def draw_worlds(scenario: Scenario, n: int, seed: int, first: int, purpose: Purpose) -> DrawnWorlds:
-    """Raises ``InvalidInput`` for bad arguments, for a mixture of lines, and for a world that has an early impact in
-    ``MOST_ATTEMPTS`` draws.
-    """
-    require_one_line(scenario)
+    """Raises ``InvalidInput`` for bad arguments, or if a world has an early impact in ``MOST_ATTEMPTS`` draws."""
     index = world_numbers(n, seed, first, purpose)
     if not scenario.members:
         return _draw_accepted(scenario, seed, purpose, index)

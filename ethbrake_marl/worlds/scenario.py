@@ -35,13 +35,7 @@ from ethbrake_marl.worlds.channel import V2X
 from ethbrake_marl.worlds.checks import ScenarioWording, check_scenario
 from ethbrake_marl.worlds.counters import Purpose, world_numbers
 from ethbrake_marl.worlds.derived import world_values
-from ethbrake_marl.worlds.mixture import (
-    DESCRIPTIVE_KEYS,
-    changed_content,
-    have_different_lines,
-    require_one_line,
-    with_members,
-)
+from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS, changed_content, with_members
 from ethbrake_marl.worlds.quantities import OF_A_TYPE, OPTIONAL, QUANTITIES, USUAL, check_length, table_columns
 from ethbrake_marl.worlds.quantity import PerVehicle, Quantity, ScenarioPart, Weight, support
 from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role, check_vehicle, names_of
@@ -227,10 +221,6 @@ class Scenario(ScenarioPart):
     def _whole(self) -> Self:
         if self.mixture is None:  # otherwise its members have been checked
             check_scenario(self)
-        elif self.lines:  # not declared, because a declared value replaces those of the members
-            longest = max(self.lines, key=lambda line: line.vehicles)
-            learners = {name: LEARNER for line in self.lines for name, role in line.roles.items() if role == LEARNER}
-            self.__dict__ |= {"vehicles": longest.vehicles, "roles": Roles(longest.roles | learners)}
         return self
 
     def __repr__(self) -> str:
@@ -265,11 +255,6 @@ class Scenario(ScenarioPart):
     def members(self) -> tuple[Scenario, ...]:
         """Each with the keys that stand next to ``mixture``; empty if this is no mixture."""
         return tuple(entry.scenario for entry in self.mixture or ())
-
-    @cached_property
-    def lines(self) -> tuple[Scenario, ...]:
-        """Such a mixture has the ``vehicles`` of its longest line; a vehicle is a learner if it learns in some line."""
-        return self.members if self.mixture and have_different_lines(self.members) else ()
 
     @cached_property
     def vehicle_names(self) -> tuple[str, ...]:
@@ -334,7 +319,6 @@ class Scenario(ScenarioPart):
         """Capacities include the limit that the road's friction sets. An undeclared rate of the brakes counts as the
         largest valid rate.
         """
-        require_one_line(self)
         at_once = np.full((2, self.vehicles), QUANTITIES[key].high)
         member_bounds = [world_values(member, member.ends).get(key, at_once) for member in self.members or (self,)]
         lows, highs = np.min(member_bounds, axis=0)[0], np.max(member_bounds, axis=0)[1]
@@ -354,8 +338,7 @@ class Scenario(ScenarioPart):
     def content(self, without: Sequence[str] = ()) -> dict[str, Any]:
         """With defaults, without the titles of a mixture's members."""
         without_words: dict[str, Any] = {"mixture": {"__all__": {"scenario": {*DESCRIPTIVE_KEYS}}}}
-        derived = ("vehicles", "roles") if self.lines else ()
-        return self.model_dump(mode="json", exclude=without_words | dict.fromkeys((*without, *derived), True))
+        return self.model_dump(mode="json", exclude=without_words | dict.fromkeys(without, True))
 
     def replace(self, **changes: Any) -> Scenario:
         """Such as ``replace(mass_t=2.0)``; in a mixture every member changes.
@@ -369,7 +352,6 @@ class Scenario(ScenarioPart):
         """The scenario with exactly these learners, such as ``["vehicle_2"]``. Former learners brake fully. Raises
         ``InvalidInput``.
         """
-        require_one_line(self)
         if isinstance(learners, str) or not isinstance(learners, Iterable):
             raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
         other_roles = {name: "full_brake" if role == LEARNER else role for name, role in self.roles.items()}

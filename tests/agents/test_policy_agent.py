@@ -25,7 +25,7 @@ from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.agents.policy_agent import LearnedAgent, policy_agent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Agent, Team, play_to_end
-from ethbrake_marl.episode.features import FEATURES, GROUPS, register_feature
+from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar
@@ -33,7 +33,7 @@ from ethbrake_marl.evaluation.evaluate import evaluate
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
-from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
+from ethbrake_marl.motion.layout import BRAKING, DRIVING
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.policies.training_range import TrainingRange
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield
@@ -116,10 +116,10 @@ def test_learned_agent__is_for_policies_of_one_action() -> None:
         LearnedAgent(brake)  # type: ignore[arg-type]
 
 
-def ranged(high: float, fallback: str = "") -> LearnedAgent:
+def ranged(high: float) -> LearnedAgent:
     """Agent whose range holds no world, or every one if ``high`` is large."""
     size = len(PPO.observation.features)
-    return LearnedAgent(PPO.with_range(TrainingRange(low=(-high,) * size, high=(high,) * size, fallback=fallback)))
+    return LearnedAgent(PPO.with_range(TrainingRange(low=(-high,) * size, high=(high,) * size)))
 
 
 def test_learned_agent__counts_decisions_outside_its_range_also_behind_a_shield() -> None:
@@ -132,25 +132,6 @@ def test_learned_agent__counts_decisions_outside_its_range_also_behind_a_shield(
             result = evaluate(sampled(), {"mine": Team("mine", {2: agent}, shield)}, scenario=PAPER)
             assert (result["mine"]["outside"] == share).all()
     assert harms(ranged(0.0)) == harms(LearnedAgent(PPO.with_range(None)))
-
-
-def like_front(state: State, body: int) -> Floats:
-    """Action by which a vehicle would brake like the one ahead, a tenth of its acceleration."""
-    return 0.1 * state.forces_mps2[:, body - 2]
-
-
-def test_learned_agent__follows_its_fallback_outside_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(FEATURES, "loaded", dict(FEATURES.loaded))
-    register_feature("like_front", like_front, unit="1", scale=1.0, low=-1.0, high=1.0)
-    assert actions(ranged(0.0, "like_front")) == pytest.approx([-0.6] * 12)  # it brakes at 6 m/s2
-    assert actions(ranged(99.0, "like_front")) == actions(LearnedAgent(PPO))
-    values = PPO.observation.observe(GAME.reset(sampled()), np.array([2]), 0.1)[:, 0]
-    middle = float(np.sort(np.abs(values), axis=1)[:, -3].mean()) - 0.05
-    mixed = ranged(middle, "like_front")
-    outside = mixed.policy.manifest.training_range.is_outside(values)
-    assert 0 < outside.sum() < 12
-    both = zip(outside, actions(mixed), actions(LearnedAgent(PPO)), strict=True)
-    assert all(mine == pytest.approx(-0.6) if out else mine == alone for out, mine, alone in both)
 
 
 # ---------------------------------------------------------------- every kind of policy

@@ -27,6 +27,4 @@ def test_show__is_for_trained_policies_that_have_a_range(ethbrake: Command, tmp_
     make_policy().save(tmp_path / "old")
     old = f"policy@{tmp_path / 'old'}"
     check_refused(ethbrake("agent", "show", old), f"agent '{old}': its file does not say what it observed in training")
-    check_refused(
-        ethbrake("agent", "show", "coast"), "agent 'coast': is no trained policy; name one, such as universal"
-    )
+    check_refused(ethbrake("agent", "show", "coast"), "agent 'coast': is no trained policy; name one, such as ppo")

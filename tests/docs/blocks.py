@@ -252,9 +252,7 @@ def read_yaml(block: Block) -> None:
     if "algorithm" in content:
         eb.load_recipe(file)
     else:
-        scenario = eb.load_scenario(file)
-        for line in scenario.lines or (scenario,):
-            line.sample(10, seed=7)
+        eb.load_scenario(file).sample(10, seed=7)
 
 
 # ---------------------------------------------------------------- commands

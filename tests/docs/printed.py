@@ -35,7 +35,7 @@ class Shown:
 
 _HONEST = tuple(
     f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo,"
-    "universal,best_harm --set measures=pushed_mps --json"
+    "plan,best_harm --set measures=pushed_mps --json"
     for test in ("", "-brake-only", "-obstacle")
 )
 TABLES: dict[str, tuple[str, ...]] = {
@@ -45,7 +45,7 @@ TABLES: dict[str, tuple[str, ...]] = {
 }
 
 PICTURES: dict[str, tuple[str, ...]] = {
-    "emergency.gif": ("ethbrake watch --agents full_brake,universal --output emergency.gif",),
+    "emergency.gif": ("ethbrake watch --agents full_brake,plan --output emergency.gif",),
     **{
         f"gallery/{film.name}": (f"python docs/studies/gallery.py . --only {film.stem}",)
         for film in sorted((DOCS / "figures" / "gallery").glob("*.gif"))

@@ -15,7 +15,7 @@ AGENTS = {
     "e_v2x_bm": r"\[?E-V2X-BM \(coupled\).*|`?e_v2x_bm`?",
     "full_brake": r"full braking|`?full_brake`?|all vehicles brake fully",
     "best_harm": r"the best known.*|`?best_harm`?",
-    "universal": r"`?universal`?(, .*trained .*)?",
+    "plan": r"`?plan`?([:,] .*)?",
     "ppo": r"`?ppo`?([:,] .*trained .*)?",
 }
 CHOOSE = ("e_v2x_bm", "best_harm")  # what they do depends on what they minimise

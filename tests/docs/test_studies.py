@@ -1,6 +1,5 @@
 """The scripts of docs/studies, and pages that tell what the code does or what was measured: paper, cooperation, ..."""
 
-import csv
 import dataclasses
 import json
 import subprocess
@@ -14,8 +13,6 @@ import ethbrake_marl as eb
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
-from ethbrake_marl.policies.bundle import load_shipped
-from ethbrake_marl.training.training import Training
 from tests.docs.printed import rows
 from tests.docs.site import DOCS, load
 
@@ -80,23 +77,14 @@ def test_morl_front__its_numbers_agree_with_each_other_and_with_full_braking() -
             assert measured["hypervolume_below_roof"] == pytest.approx(volume_below(np.full(3, found["roof"]), points))
 
 
-lines = load("../studies/lines")
-
-
-def test_lines__are_trained_on_by_their_recipe() -> None:
-    training = Training.of("universal", lines.mixture())
-    assert {line.scenario.vehicles for line in training.lines} == {2, 3, 4, 5, 6, 8}
-    assert {body for line in training.lines for body in line.scenario.learners} == {*range(1, 9)}
-    assert sum(line.recipe.n_envs for line in training.lines) == pytest.approx(training.recipe.n_envs, rel=0.02)
-    for line in training.lines:
-        assert line.scenario.sample(5, 7).vehicles == line.scenario.vehicles
+competence = load("../studies/competence")
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("lines.py {file}", "lines.py: error: "),
-        ("competence.py rule", "competence.py: error: rule needs a policy, such as runs/lines/start"),
+        ("competence.py rule", "competence.py: error: rule needs a policy, such as runs/three-tests"),
+        ("competence.py warning {file}", "competence.py: error: "),
     ],
 )
 def test_studies__end_with_a_message(words: str, message: str, tmp_path: Path) -> None:
@@ -109,47 +97,43 @@ def test_studies__end_with_a_message(words: str, message: str, tmp_path: Path) -
 
 
 def test_competence__has_a_best_known_cost_of_every_line() -> None:
-    competence = load("../studies/competence")
     best = json.loads(competence.BEST.read_text("utf-8"))
-    assert best.keys() == {*competence.shipped(), *dict(competence.places())}
+    assert best.keys() == competence.every_line().keys()
     assert len(best) > 80 and all(cost >= 0.0 for cost in best.values())
 
 
-NO_NUMBERS = ("line", "learners")  # columns of lines.csv
+def test_page__has_the_numbers_of_plan_in_every_line() -> None:
+    table = competence.read_table()
+    assert rows("findings", "## `plan` in every line")[1:] == competence.page_rows(table)
+    numbers = [tuple(row[agent] for agent in (*competence.RIVALS, competence.AGENT)) for row in table]
+    assert len(set(numbers)) == len(table) > 60
 
 
-def test_page_of_universal__has_the_numbers_of_the_lines() -> None:
-    competence = load("../studies/competence")
-    table = list(csv.DictReader(competence.TABLE.read_text("utf-8").splitlines()))
-    costs = {row["line"]: {key: float(cell) for key, cell in row.items() if key not in NO_NUMBERS} for row in table}
-    groups: dict[str, list[str]] = {"one learner": [], "several learners": [], "the channel hides values": []}
-    for row in table:
-        known = "several learners" if " " in row["learners"] else "one learner"
-        groups["the channel hides values" if float(row["hidden"]) else known].append(row["line"])
-    recomputed = []
-    for group, names in groups.items():
-        for agent in competence.LEARNED:
-            better = {name: min(costs[name][rule] for rule in competence.rules_of(costs[name])) for name in names}
-            worse = sum(competence.is_worse(costs[name][agent], better[name]) for name in names)
-            searched = [name for name in names if costs[name]["best_known"] >= competence.NO_COST]
-            ratios = {name: costs[name][agent] / costs[name]["best_known"] for name in searched}
-            worst = max(ratios, key=lambda name: ratios[name])
-            titles = [group, str(len(names))] if agent == competence.POLICY else ["", ""]
-            numbers = [str(worse), f"{np.median([*ratios.values()]):.2f}", f"{ratios[worst]:.2f} (`{worst}`)"]
-            recomputed.append([*titles, f"`{agent}`", *numbers])
-    assert rows("reference/policies", "## `universal` in every line")[1:] == recomputed
-    agents_numbers = {tuple(row[key] for key in row if key != "best_known") for row in costs.values()}
-    page = " ".join((DOCS / "reference" / "policies.md").read_text("utf-8").split())
-    assert f"{len(costs)} rows, of which {len(agents_numbers)} differ" in page
-    assert f"In each of [{len(agents_numbers)} lines](" in (DOCS.parent / "README.md").read_text("utf-8")
-    rivals = {name: min(row[rule] for rule in competence.rules_of(row)) for name, row in costs.items()}
-    assert all(row[competence.POLICY] <= 1.01 * rivals[name] for name, row in costs.items())
+def test_row__has_what_an_evaluation_says() -> None:
+    row = competence.row_of(eb.load_scenario("paper-random"), 9.0)
+    result = eb.evaluate(
+        "paper-random", "full_brake,plan", episodes=competence.WORLDS, seed=competence.SEED, measures="pushed_mps"
+    )
+    brake, plan = result["full_brake"]["honest_cost"], result["plan"]["honest_cost"]
+    assert (row["full_brake"], row["plan"]) == (brake.mean(), plan.mean())
+    assert (row["learners"], row["hidden"], row["best_known"]) == ("2", 0.0, 9.0)
+    assert row["over_1"] == (plan - brake > 1.0).mean() and row["plan_push_mps"] == result["plan"]["pushed_mps"].mean()
+    assert row["worst5"] == np.sort(plan)[-15:].mean() < row["full_brake_worst5"] == np.sort(brake)[-15:].mean()
+    assert competence.row_of(eb.load_scenario("paper-random"), 99.0)["best_known"] == plan.mean()
 
 
-def test_universal__was_trained_by_its_recipe_on_its_lines() -> None:
-    policy, recipe = load_shipped("universal"), eb.load_recipe("universal")
-    manifest = policy.manifest
-    assert manifest.scenario == lines.mixture().content()
-    assert policy.observation.names == eb.View(recipe.observation).names
-    assert (manifest.algorithm, manifest.network.policy_hidden) == (recipe.algorithm, recipe.network.policy)
-    assert recipe.total_steps <= manifest.steps < recipe.total_steps + 20_000
+def test_page_rows__by_hand() -> None:
+    def row(name: str, cost: float, best: float, **more: object) -> dict[str, str]:
+        numbers = {"learners": "2", "hidden": 0, "full_brake": 20, "e_v2x_bm": 10, "plan:1": 11, "plan": cost}
+        return {"line": name, **{key: str(cell) for key, cell in (numbers | {"best_known": best, **more}).items()}}
+
+    table = [
+        row("a", 8.0, 8.0, over_1=0.0), row("b", 12.0, 6.0, over_1=0.01), row("c", 10.2, 9.0, over_1=0.002),
+        row("d", 20.0, 19.9, over_1=0.0, e_v2x_bm=30), row("e", 0.04, 0.01, over_1=0.0),
+        row("f", 5.0, 4.0, over_1=0.0, learners="2 3"), row("g", 10.5, 10.0, over_1=0.5, hidden=1.0),
+    ]  # fmt: skip
+    assert competence.page_rows(table) == [
+        ["one learner", "5", "1: `b`", "1.13", "2.00 (`b`)", "1.0 % (`b`)"],
+        ["several learners", "1", "0", "1.25", "1.25 (`f`)", "0.0 % (`f`)"],
+        ["the channel hides values", "1", "0", "1.05", "1.05 (`g`)", "50.0 % (`g`)"],
+    ]

@@ -263,7 +263,7 @@ FOLDERS: dict[str, Callable[[], Any]] = {
     "/dev/zero: is not a folder; give the folder of a policy bundle": lambda: load_policy("/dev/zero"),
     "nowhere: is not a folder": lambda: load_drivers(Path("nowhere")),
     "empty: contains no policy; give the folder": lambda: load_policy("empty"),
-    "unknown shipped policy 'universel'; did you mean 'universal'?": lambda: load_shipped("universel"),
+    "unknown shipped policy 'vine-papre'; did you mean 'vine-paper'?": lambda: load_shipped("vine-papre"),
 }
 
 

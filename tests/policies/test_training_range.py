@@ -11,11 +11,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from ethbrake_marl.episode.features import FEATURES, register_feature
-from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import CorruptBundle
-from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.bundle import load_policy, load_shipped, shipped_policies
 from ethbrake_marl.policies.training_range import TrainingRange
 from tests.policies.test_bundles import make_policy
 from tests.refused import refused
@@ -37,21 +34,19 @@ def test_outside__three_features_by_more_than_the_margin() -> None:
     assert FOUR.is_outside(observations).tolist() == [False, True, False, True]
 
 
-def brakes_fully(state: State, body: int) -> Floats:
-    """Full braking as an action."""
-    return np.full(state.n, -1.0)
-
-
-def test_policy__keeps_its_range_in_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(FEATURES, "loaded", dict(FEATURES.loaded))
-    register_feature("brakes_fully", brakes_fully, unit="1", scale=1.0, low=-1.0, high=1.0)
+def test_policy__keeps_its_range_in_its_file(tmp_path: Path) -> None:
     policy = make_policy()
     size = len(policy.observation.features)
-    ranged = policy.with_range(TrainingRange(low=(0.0,) * size, high=(1 / 3,) * size, fallback="brakes_fully"))
+    ranged = policy.with_range(TrainingRange(low=(0.0,) * size, high=(1 / 3,) * size))
     assert policy.manifest.training_range is None and "training_range" not in policy.manifest.model_dump()
     ranged.save(tmp_path / "a")
     assert load_policy(tmp_path / "a").manifest == ranged.manifest != policy.manifest
     assert ranged.with_range(None).manifest == policy.manifest
+
+
+def test_shipped_policies__all_have_a_range() -> None:
+    ranges = {name: load_shipped(name).manifest.training_range for name in shipped_policies()}
+    assert ranges.keys() == {"ppo", "sac", "vine-paper", "vine-preference"} and None not in ranges.values()
 
 
 @pytest.mark.parametrize(
@@ -59,11 +54,6 @@ def test_policy__keeps_its_range_in_its_file(tmp_path: Path, monkeypatch: pytest
     [
         ({"low": (0.0,), "high": (1.0,)}, "training_range: has 1 features; must have"),
         ({"low": (0.0, 1.0), "high": (1.0,)}, "training_range: low, high: must have one number for each feature, low"),
-        ({"low": (0.0,), "high": (1.0,), "fallback": "plan.actoin"}, "unknown feature 'plan.actoin'"),
-        (
-            {"low": (0.0,), "high": (1.0,), "fallback": "front_1.gap"},
-            "training_range: fallback = front_1.gap: must be an action: a feature of unit 1 and scale 1",
-        ),
     ],
 )
 def test_bad_range__is_refused(change: dict[str, Any], text: str, tmp_path: Path) -> None:

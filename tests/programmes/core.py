@@ -31,7 +31,7 @@ COPIED = (
 APART = ("docs", "programmes")  # tests of the whole repository, not only of the core
 INSTALLATION = ("test_imports.py",)  # start many processes
 OF_ALL = ("extensions/test_printed.py",)  # what all extensions print together
-BY_NAME = {  # uses beside imports: recipes that observe forecasts; the policy `universal`, which a search starts with
+BY_NAME = {  # uses beside imports: recipes that observe forecasts; the agent `plan`, with which a search starts
     "extensions.learners": {"extensions.forecasts"},
     "extensions.search": {"extensions.forecasts"},
 }

@@ -10,11 +10,9 @@ from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.policies.training_range import TrainingRange
 from ethbrake_marl.training import training_range
 from ethbrake_marl.training.training import Training
 from ethbrake_marl.training.training_range import record_ranges, with_ranges
-from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.contract.interfaces import REST
 from tests.policies.test_networks import FIELDS, network, tensors_for
 from tests.training.tiny import TINY
@@ -27,19 +25,12 @@ def full_braking(*names: str) -> Policy:
     return Policy.make(tensors, network=spec, observation=View(names), **FIELDS)
 
 
-def drives(state: State, body: int) -> Floats:
-    """Full drive as an action."""
-    return np.ones(state.n)
-
-
-def test_range__is_that_of_the_decisions_before_rest_without_any_fallback() -> None:
+def test_range__is_that_of_the_decisions_before_rest() -> None:
     """5.7 m/s, and 0.6 m/s less at each of ten decisions, without the least and the largest; the unit is 20 m/s."""
-    register_feature("drives", drives, unit="1", scale=1.0, low=-1.0, high=1.0)
-    never = TrainingRange(low=(9.0,) * 3, high=(9.0,) * 3, fallback="drives")
-    policy = full_braking("own.speed", "own.acceleration", "front_1.gap").with_range(never)
-    (ranged,) = record_ranges({"vehicle_2": policy}, REST, 1, seed=0, fallback="drives").values()
+    policy = full_braking("own.speed", "own.acceleration", "front_1.gap")
+    (ranged,) = record_ranges({"vehicle_2": policy}, REST, 1, seed=0).values()
     known = ranged.manifest.training_range
-    assert known is not None and known.fallback == "drives"
+    assert known is not None
     assert (known.low[0], known.high[0]) == pytest.approx((0.9 / 20, 5.1 / 20), abs=1e-6)
 
 
@@ -55,12 +46,6 @@ def counted() -> dict[int, int]:
 
     register_feature("counts", count, unit="1", scale=1.0, low=0.0, high=1.0)
     return numbers
-
-
-def test_range__of_a_mixture_is_from_as_many_worlds_of_every_line(counted: dict[int, int]) -> None:
-    lines = [{"scenario": "paper-random"}, {"scenario": REST.declared()}]
-    record_ranges({"vehicle_2": full_braking("counts")}, load_scenario({"name": "both", "mixture": lines}), 5, seed=7)
-    assert counted == {3: 3, 2: 3}
 
 
 @pytest.mark.parametrize(("most", "driven"), [(4, 4), (1000, 10)])

@@ -181,6 +181,12 @@ REFUSED: dict[str, Callable[[], object]] = {
     "mine.yaml, line 2: mixture: paper-random is listed twice; list it once, with the sum of its weights": lambda: (
         loaded("mixture: [{scenario: paper-random}, {scenario: paper-random}]")
     ),
+    "mine.yaml, line 2: mixture: vehicles must be the same in all scenarios of the mixture, but paper": lambda: loaded(
+        "mixture: [{scenario: paper-random}, {scenario: cooperation-2-five}]"
+    ),
+    "mine.yaml, line 2: mixture: roles must be the same in all scenarios of the mixture, but paper-ra": lambda: loaded(
+        "mixture: [{scenario: paper-random}, {scenario: cooperation-3-pair}]"
+    ),
     "mine.yaml, line 2: mixture: horizon_s must be the same in all scenarios of the mixture, but": lambda: loaded(
         "mixture: [{scenario: paper-random}, {scenario: stress-wide}]"
     ),

@@ -1,4 +1,4 @@
-"""The offline data set of a task: E-V2X-BM, `universal` and random commands in the worlds of seed 1.
+"""The offline data set of a task: E-V2X-BM, `plan` and random commands in the worlds of seed 1.
 
     python train/benchmark/data.py benchmark-single benchmark-single.parquet
 
@@ -54,7 +54,7 @@ if __name__ == "__main__":
     parser.add_argument("output", type=Path, help="new Parquet file")
     parser.add_argument("--episodes", type=int, default=EPISODES, help=f"of each agent (default: {EPISODES})")
     args = parser.parse_args()
-    agents = {"e_v2x_bm": eb.make_agent("e_v2x_bm", scenario=args.task, harm_count="honest"), "universal": "universal"}
+    agents = {name: eb.make_agent(name, scenario=args.task, harm_count="honest") for name in ("e_v2x_bm", "plan")}
     try:
         to_parquet(
             args.output, {**agents, "random": Random()}, scenario=args.task, episodes=args.episodes, seed=SEED,

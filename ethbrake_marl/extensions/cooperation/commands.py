@@ -12,7 +12,7 @@ from rich.text import Text
 from ethbrake_marl.cli.command import ForceOption, JobsOption, JsonOption, Out, SettingsOption, example
 from ethbrake_marl.errors import InvalidInput
 
-DEFAULT_AGENTS = "e_v2x_bm,universal"  # agents that are compared with the front if the scenario has one learner
+DEFAULT_AGENTS = "e_v2x_bm,plan"  # agents that are compared with the front if the scenario has one learner
 AFTER_STOPPED_STUDY = "the same command continues the work in this folder"
 
 
@@ -145,7 +145,7 @@ def front_command(
         typer.Option(
             metavar="A,B,...",
             help="Agents to compare with the Pareto front.",
-            show_default="e_v2x_bm,universal with one learner, else none",
+            show_default="e_v2x_bm,plan with one learner, else none",
         ),
     ] = None,
     weights: Annotated[

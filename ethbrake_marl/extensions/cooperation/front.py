@@ -123,8 +123,8 @@ def search_front(
     """Search every world for the commands with the least weighted harm, for every choice of weights.
 
     The result is at most the weighted harm of ``FRONT_CONSTANTS`` constant commands, the shipped profiles of this
-    world, ``agents``, every shipped policy, and the results for all other choices; and, with several learners that
-    decide at the same times, what the same search reaches with each of them alone. No world depends on another.
+    world, ``agents``, ``plan``, every shipped policy, and the results for all other choices; and, with several learners
+    that decide at the same times, what the same search reaches with each of them alone. No world depends on another.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import search_front
@@ -159,7 +159,7 @@ def search_front(
         )
     if not scenario.learners:
         raise InvalidInput(f"scenario {scenario.name!r} has no learner, whose commands could be searched")
-    names = [*agents, *(name for name in shipped_policies() if name not in agents)]
+    names = [*agents, *(name for name in ("plan", *shipped_policies()) if name not in agents)]
     together = Drivers.of(scenario, weights, names, count)
     done, searches = 0, 2 * len(weights) * worlds.n * (1 + len(together.alone))
 

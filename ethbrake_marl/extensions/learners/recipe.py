@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from ethbrake_marl.agents.trained import make_trained
-from ethbrake_marl.episode.features import feature_named, listed_features
 from ethbrake_marl.episode.layer import MESSAGES
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.model import FileModel, Positive, refuse, require
+from ethbrake_marl.files.model import FileModel, Positive, refuse
 from ethbrake_marl.policies.network import Activation
 from ethbrake_marl.registry import Part
 from ethbrake_marl.training.recipe import ACTOR_LAYERS, BATCH_SIZE, NETWORK, LayerSizes, Rate, TrainingRecipe
@@ -19,10 +17,6 @@ MOST_DECISIONS = 2**22  # of one update whose states fit into memory
 
 Text = Annotated[str, Field(max_length=4096)]
 Action = Annotated[float, Field(ge=-1.0, le=1.0)]
-ActionOrFeature = Annotated[
-    Annotated[Action, Tag("#number")] | Annotated[str, Field(max_length=64), Tag("#feature")],
-    Discriminator(lambda value: "#feature" if isinstance(value, str) else "#number"),
-]
 Steps = Annotated[tuple[Annotated[int, Field(ge=1, le=1000)], ...], Field(strict=False, min_length=1, max_length=16)]
 
 
@@ -43,40 +37,13 @@ class Range(FileModel):
 class ActorShape(FileModel):
     policy: LayerSizes = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"
-    initial_action: Annotated[ActionOrFeature | None, Field(exclude_if=lambda action: action is None)] = Field(
-        None,
-        description="action of the untrained network: approximately a number from -1 to 1, or exactly an observed"
-        " feature such as plan.action; left out: 0, which coasts",
+    initial_action: Annotated[Action | None, Field(exclude_if=lambda action: action is None)] = Field(
+        None, description="approximate action of the untrained network, from -1 to 1; left out: 0, which coasts"
     )
-
-    @field_validator("initial_action")
-    @classmethod
-    def _is_an_action(cls, value: float | str | None) -> float | str | None:
-        if isinstance(value, str):
-            try:
-                features = [feature_named(name) for name in listed_features([value])]
-            except InvalidInput as error:
-                raise ValueError(str(error)) from None
-            if not all(feature.scale == 1.0 and -1.0 <= feature.low <= feature.high <= 1.0 for feature in features):
-                raise ValueError("must be one feature with scale 1 and a range inside [-1, 1], such as plan.action")
-        return value
-
-    @model_validator(mode="after")
-    def _network_can_begin_as_a_feature(self) -> Self:
-        if isinstance(self.initial_action, str):
-            right = f"for the network to begin as {self.initial_action}"
-            require(self.activation == "relu", ("activation",), self.activation, f"must be relu {right}")
-            require(min(self.policy) >= 2, ("policy",), list(self.policy), f"needs 2 units in every layer {right}")
-        return self
 
 
 class VineRecipe(TrainingRecipe):
-    """Recipe of vine: the difference in return between a higher and a lower action gives the gradient.
-
-    In a mixture of lines, returns are divided by the cost of full braking in the line.
-    """
-
-    mixes_lines: ClassVar[bool] = True
+    """Recipe of vine: the difference in return between a higher and a lower action gives the gradient."""
 
     n_steps: int = Field(ge=1, description="number of decisions in each world between two updates")
     tried: int = Field(ge=1, description="number of decisions per update at which other actions are tried")
@@ -115,8 +82,8 @@ class VineRecipe(TrainingRecipe):
 
     @model_validator(mode="after")
     def _begins_in_one_way(self) -> Self:
-        if self.start is not None and isinstance(self.network.initial_action, float):
-            right = "must be left out, or name a feature, beside the key start, whose policy gives the first action"
+        if self.start is not None and self.network.initial_action is not None:
+            right = "must be left out beside the key start, whose policy gives the first action"
             refuse(("network", "initial_action"), self.network.initial_action, right)
         return self
 

@@ -10,7 +10,7 @@ n: branches, or worlds; m: branches that still run; L: learners, front to rear; 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -32,8 +32,6 @@ from ethbrake_marl.motion.layout import FORCE, GAP, HIT, LATENCY, SPEED, Bools, 
 from ethbrake_marl.policies.layers import Float32s
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.training.algorithm import Algorithm, tensors_of
-from ethbrake_marl.training.fixed_list import braking_cost
-from ethbrake_marl.training.lines import LinesVecEnv
 from ethbrake_marl.training.training import Training
 
 ROUNDING_MPS2 = 1e-5  # forces closer than this are equal: a network's rounding depends on its batch size
@@ -52,26 +50,9 @@ class Vine(Algorithm):
         return tensors_of("policy", actor.average) | log_std
 
 
-class Line(NamedTuple):
-    """One line of vehicles of a training: that of its scenario, or one of a mixture of lines."""
-
-    environment: EthBrakeVecEnv
-    tried: int  # decisions per update at which other actions are tried
-    cost: float  # returns are divided by it: 1, or in a mixture of lines the cost of full braking
-
-    @property
-    def game(self) -> Game:
-        return self.environment.game
-
-    @property
-    def learners(self) -> int:
-        return len(self.environment.bodies)
-
-
 class Visited(NamedTuple):
-    """Decisions of L learners in D visited states of a line."""
+    """Decisions of L learners in D visited states."""
 
-    line: Line
     observations: Float32s  # [D * L, F]
     states: State  # [D]
 
@@ -101,7 +82,7 @@ class VineModel(BaseAlgorithm):
 
     policy: Any  # an `Actor`
 
-    def __init__(self, training: Training, environment: EthBrakeVecEnv | LinesVecEnv) -> None:
+    def __init__(self, training: Training, environment: EthBrakeVecEnv) -> None:
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
         super().__init__(
@@ -115,7 +96,7 @@ class VineModel(BaseAlgorithm):
         )
         self.recipe = recipe
         self.rows, self.features = environment, training.row.names
-        self.lines = lines_of(training, environment)
+        self.learners = len(environment.bodies)
         self._setup_model()
 
     def _setup_model(self) -> None:
@@ -146,19 +127,18 @@ class VineModel(BaseAlgorithm):
             visited = self.collect(callback)
             callback.on_rollout_end()
             self._update_current_progress_remaining(self.num_timesteps, total)
-            self.improve(visited)
+            self.train_actor(self.try_out(visited))
         callback.on_training_end()
         return self
 
-    def collect(self, callback: BaseCallback) -> list[Visited]:
+    def collect(self, callback: BaseCallback) -> Visited:
         """Drive all worlds for ``n_steps`` decisions."""
         all_observations: list[Any] = []
-        states: list[list[State]] = [[] for _ in self.lines]
+        states: list[State] = []
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
             all_observations.append(observations)
-            for line, line_states in zip(self.lines, states, strict=True):
-                line_states.append(line.environment.episode.take(np.arange(line.environment.n)))
+            states.append(self.rows.episode.take(np.arange(self.rows.n)))
             new_obs, rewards, dones, infos = self.rows.step(self.policy.act(observations)[:, np.newaxis])
             self.num_timesteps += self.n_envs
             ended = [infos[row] for row in np.flatnonzero(dones)]  # only these have statistics
@@ -166,37 +146,26 @@ class VineModel(BaseAlgorithm):
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
             callback.update_locals(locals())
             callback.on_step()
-        visited, first = [], 0
-        for line, line_states in zip(self.lines, states, strict=True):
-            rows = slice(first, first + line.environment.num_envs)
-            line_observations = np.concatenate([observations[rows] for observations in all_observations])
-            visited.append(Visited(line, line_observations, State.join(line_states)))
-            first = rows.stop
-        return visited
-
-    def improve(self, visited: Sequence[Visited]) -> None:
-        results = [self.try_out(decisions) for decisions in visited]
-        self.train_actor(TrialResults(*(torch.cat(parts) for parts in zip(*results, strict=True))))
+        return Visited(np.concatenate(all_observations), State.join(states))
 
     def try_out(self, visited: Visited) -> TrialResults:
         """Results at random visited decisions, simulated with a higher and with a lower action than the policy's."""
-        line, observations, states = visited
-        branches = self.draw_branches(line, np.flatnonzero(moving(states).repeat(line.learners)))
-        gained, moved = self.play(line.game, states, branches)
-        sample = observations[branches.decisions(line.learners)]
-        gradient = self.measured_gradient(torch.from_numpy(gained / line.cost), torch.from_numpy(moved))
+        branches = self.draw_branches(np.flatnonzero(moving(visited.states).repeat(self.learners)))
+        gained, moved = self.play(visited.states, branches)
+        sample = visited.observations[branches.decisions(self.learners)]
+        gradient = self.measured_gradient(torch.from_numpy(gained), torch.from_numpy(moved))
         return TrialResults(torch.from_numpy(sample), torch.from_numpy(self.policy.means(sample)), gradient)
 
-    def draw_branches(self, line: Line, decisions: Ints) -> Branches:
-        rows = decisions[torch.randperm(len(decisions))[: line.tried].numpy()]
+    def draw_branches(self, decisions: Ints) -> Branches:
+        rows = decisions[torch.randperm(len(decisions))[: self.recipe.tried].numpy()]
         offset, holds = self.recipe.offset, np.array(self.recipe.holds, np.int64)
         ratio = offset.largest / offset.smallest
         sizes: Floats = offset.smallest * ratio ** torch.rand(len(rows), dtype=torch.float64).numpy()
         steps = holds[torch.randint(len(holds), (len(rows),)).numpy()]
-        world, learner = np.divmod(np.tile(rows, 2), line.learners)
+        world, learner = np.divmod(np.tile(rows, 2), self.learners)
         return Branches(world, learner, np.concatenate([sizes, -sizes]), np.tile(steps, 2))
 
-    def play(self, game: Game, states: State, branches: Branches) -> tuple[Floats, Floats]:
+    def play(self, states: State, branches: Branches) -> tuple[Floats, Floats]:
         """Discounted return of each branch's learner, and how far its actions were moved, [2B] each.
 
         An action stays in [-1, 1], so it may move by less than ``size``. Moves are summed over the steps.
@@ -214,7 +183,7 @@ class VineModel(BaseAlgorithm):
             moved[row] += after - before
             return actions
 
-        gained = play_on(game, states.take(world), decide, self.recipe.gamma, at_least=longest)
+        gained = play_on(self.rows.game, states.take(world), decide, self.recipe.gamma, at_least=longest)
         return gained[np.arange(len(size)), learner], moved
 
     def measured_gradient(self, gained: Tensor, moved: Tensor) -> Tensor:
@@ -243,16 +212,6 @@ class VineModel(BaseAlgorithm):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
         self.logger.record("train/gradient", float(results.gradient.abs().mean()) if losses else 0.0)
         self.logger.record("train/tried", len(results.seen))
-
-
-def lines_of(training: Training, environment: EthBrakeVecEnv | LinesVecEnv) -> list[Line]:
-    tried: int = vars(training.recipe)["tried"]
-    if isinstance(environment, EthBrakeVecEnv):
-        return [Line(environment, tried, 1.0)]
-    pairs = zip(environment.environments, training.lines, strict=True)
-    return [
-        Line(part, max(round(tried * part.n / training.recipe.n_envs), 1), braking_cost(line)) for part, line in pairs
-    ]
 
 
 def trusted_targets(results: TrialResults, radius: float, anchor: float) -> tuple[Tensor, Tensor]:

@@ -57,7 +57,7 @@ STANDALONE = "Standalone DRL"
 HARMS = {"first": "first-impact harm", "total": "total harm"}
 SCALES = {**{count: (harm, 1.0) for count, harm in HARMS.items()}, "collided": ("% of worlds", 100.0)}
 STOPPED_WORLDS = 5_000
-GRADIENT = "universal"  # shipped policy, trained by the algorithm ``vine``
+GRADIENT = "vine-paper"  # shipped policy, trained by the algorithm ``vine``
 
 UNCONVERGED = STANDALONE, "Hybrid"  # rows of a policy that has not converged; where ours stops is our choice
 MAP_WORLDS, MAP_STEPS_S = 250, (0.1, 0.2, 0.25, 0.3)  # of the bound in the paper's map

@@ -34,8 +34,8 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 SEARCH_CANDIDATES = 500  # plans that +search simulates
 MOST_CANDIDATES = 1_000_000
-START = {"honest": "universal"}  # name of a count -> policy whose commands ``best_harm`` improves, too
-OTHER_START = "ppo"  # the policy for every other count
+START = {"honest": "plan"}  # name of a count -> agent whose commands ``best_harm`` improves, too
+OTHER_START = "ppo"  # the agent for every other count
 DECISION_ROUNDING = 1e-6  # part of a step: a time this close before a decision counts as the decision
 
 
@@ -78,9 +78,9 @@ class Planner(Predicting):
 class BestHarm(Planner):
     """Drives the best known commands: from a shipped table, or from a search.
 
-    If it is the only learner, it never does more harm than E-V2X-BM and a shipped policy, whose commands are improved
-    once more. Several learners with one objective follow the joint optimum of an ablation: the best known commands of
-    all of them together.
+    If it is the only learner, it never does more harm than E-V2X-BM and the agent of ``START``, whose commands are
+    improved once more. Several learners with one objective follow the joint optimum of an ablation: the best known
+    commands of all of them together.
     """
 
     def __init__(
@@ -142,12 +142,12 @@ class BestHarm(Planner):
         if self.scenario.learners != (body,):
             return best, values[self.harm_count.name]
         start = START.get(self.harm_count.name, OTHER_START)
-        policy = make_agent(start, scenario=self.scenario)
-        assert not isinstance(policy, Team)
-        policy_commands = agent_commands(problem, game, alert, Team(start, {body: policy}))[:, :, 0]
-        better = refine(problem, policy_commands, budget=1)[1] < values[self.harm_count.name]
-        first = np.where(better[:, np.newaxis], policy_commands, best[:, : policy_commands.shape[1]])
-        best[:, : policy_commands.shape[1]], harm = refine(problem, first, budget=self.budget)
+        agent = make_agent(start, scenario=self.scenario)
+        assert not isinstance(agent, Team)
+        commands = agent_commands(problem, game, alert, Team(start, {body: agent}))[:, :, 0]
+        better = refine(problem, commands, budget=1)[1] < values[self.harm_count.name]
+        first = np.where(better[:, np.newaxis], commands, best[:, : commands.shape[1]])
+        best[:, : commands.shape[1]], harm = refine(problem, first, budget=self.budget)
         return best, harm
 
 

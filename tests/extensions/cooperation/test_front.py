@@ -71,12 +71,13 @@ def test_point__is_never_beaten_under_its_weights_by_another_point_a_constant_or
             assert (least <= weighted_harm(borne, row)).all()
 
 
-def test_point__is_never_beaten_by_a_shipped_policy_that_was_not_given() -> None:
+def test_point__is_never_beaten_by_an_agent_that_was_not_given() -> None:
     obstacle, row = eb.load_scenario("paper-random-obstacle"), np.array([0.2, 0.8, 0.0])
     found = search_front(obstacle, obstacle.sample(20, 777), [row], budget=30, harm_count="total")
     scenario, game = eb.open_game(obstacle.replace(harm_weight=row.tolist(), objective="preference"))
-    for name in ("universal", "vine-paper", "ppo"):
-        last = play_to_end(game, scenario.sample(20, 777), Team(name, {2: eb.make_agent(name)}))
+    for name in ("plan", "vine-paper", "ppo"):
+        agent = eb.make_agent(name, scenario=scenario)
+        last = play_to_end(game, scenario.sample(20, 777), Team(name, {2: agent}))
         assert (found.amounts[0] <= weighted_harm(last.borne_harm("total"), row)).all()
 
 
@@ -102,11 +103,11 @@ def test_equal_weights__are_as_good_as_the_tables(front: Front) -> None:
 
 
 def test_honest_cost__is_the_default_and_leaves_less_of_it_than_the_papers_rules(front: Front) -> None:
-    mine = search_front(PAPER, sampled().take(np.arange(6)), WEIGHTS[[3]], budget=300, agents=["universal"])
-    cost, papers, universal = (each["honest"][0].sum(axis=1) for each in (
-        mine.borne, {"honest": front.borne["honest"][[3], :6]}, mine.agents["universal"]
+    mine = search_front(PAPER, sampled().take(np.arange(6)), WEIGHTS[[3]], budget=300, agents=["plan"])
+    cost, papers, planned = (each["honest"][0].sum(axis=1) for each in (
+        mine.borne, {"honest": front.borne["honest"][[3], :6]}, mine.agents["plan"]
     ))  # fmt: skip
-    assert mine.harm_count == HarmCount.of("honest") and (cost <= universal).all() and cost.mean() < 0.9 * papers.mean()
+    assert mine.harm_count == HarmCount.of("honest") and (cost <= planned).all() and cost.mean() < 0.9 * papers.mean()
     assert (mine.amounts[0] == pytest.approx(cost)) and (mine.borne["total"][0].sum(axis=1) <= cost + 1e-9).all()
 
 
@@ -137,7 +138,7 @@ def test_maximin__is_at_least_as_good_for_whoever_bears_most_as_every_point(fron
 @pytest.mark.parametrize("count", ["honest", pytest.param("first", marks=pytest.mark.slow)])
 def test_two_learners__are_never_worse_than_one_nor_than_agents_that_drive_one_or_both(count: str) -> None:
     pair, rows, heard = eb.load_scenario("cooperation-3-pair"), WEIGHTS[[1, 3, 6]], []
-    agents = ["e_v2x_bm", "universal"]
+    agents = ["e_v2x_bm", "plan"]
     found, *alone = (
         search_front(
             scenario, scenario.sample(8, 990801), rows, harm_count=count, budget=60, agents=agents,

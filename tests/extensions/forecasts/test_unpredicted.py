@@ -28,20 +28,13 @@ def without(scenario: Any, piece: str, senders: list[int], **v2x: Any) -> eb.Sce
 @pytest.mark.parametrize("senders", [[1], [3], [1, 3]])
 @pytest.mark.parametrize("scenario", ["paper-random", "cooperation-2-five"])
 def test_neighbour_without_a_piece__is_met_with_full_braking(scenario: str, senders: list[int], piece: str) -> None:
-    result = eb.evaluate(
-        without(scenario, piece, senders), "full_brake,plan,universal", episodes=20, harm_count="honest"
-    )
-    full = result["full_brake"]["honest_cost"]
-    np.testing.assert_array_equal(result["plan"]["honest_cost"], full)
-    np.testing.assert_allclose(result["universal"]["honest_cost"].mean(), full.mean(), rtol=0.01)
-    assert result["universal"]["outside"].mean() > 0.95
+    result = eb.evaluate(without(scenario, piece, senders), "full_brake,plan", episodes=20, harm_count="honest")
+    np.testing.assert_array_equal(result["plan"]["honest_cost"], result["full_brake"]["honest_cost"])
 
 
 def test_farther_vehicle_without_a_piece__ends_the_forecast_before_it() -> None:
-    result = eb.evaluate(without("cooperation-2-five", "mass", [5]), "full_brake,plan,universal", episodes=50)
-    cost = {name: result[name]["honest_cost"].mean() for name in result}
-    assert max(cost["plan"], cost["universal"]) < 0.8 * cost["full_brake"]
-    assert (result["universal"]["outside"] == 0.0).all()
+    result = eb.evaluate(without("cooperation-2-five", "mass", [5]), "full_brake,plan", episodes=50)
+    assert result["plan"]["honest_cost"].mean() < 0.8 * result["full_brake"]["honest_cost"].mean()
 
 
 def observed(scenario: eb.Scenario, until_s: float) -> dict[str, np.ndarray]:
@@ -70,14 +63,10 @@ def test_far_neighbour_without_a_piece__does_not_matter() -> None:
         latency_s=[0, 0.5, 0.8, 0.8], early_impacts="keep",
     )  # fmt: skip
     told = four.replace(v2x={"preset": "nominal", "persistence": "periodic"})
-    results = [
-        eb.evaluate(line, "full_brake,plan,universal", episodes=20) for line in (told, without(four, "mass", [1]))
-    ]
-    for name in ("plan", "universal"):
-        costs = [result[name]["honest_cost"] for result in results]
-        np.testing.assert_array_equal(*costs)
-        assert costs[0].mean() < 0.8 * results[0]["full_brake"]["honest_cost"].mean()
-    np.testing.assert_array_equal(*(result["universal"]["outside"] for result in results))
+    results = [eb.evaluate(line, "full_brake,plan", episodes=20) for line in (told, without(four, "mass", [1]))]
+    costs = [result["plan"]["honest_cost"] for result in results]
+    np.testing.assert_array_equal(*costs)
+    assert costs[0].mean() < 0.8 * results[0]["full_brake"]["honest_cost"].mean()
 
 
 def test_who_knows_nobody__brakes_fully() -> None:

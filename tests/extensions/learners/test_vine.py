@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.learners.actor import Actor, linear_layers, widen
+from ethbrake_marl.extensions.learners.actor import Actor, widen
 from ethbrake_marl.extensions.learners.vine import TrialResults, Visited, trusted_targets
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.recipe import load_recipe
@@ -38,13 +37,13 @@ def test_measured_gradients__are_those_of_the_return_up_to_their_limit(limit: fl
     recipe = VINE.replace(gradient_limit=limit, holds=[2], tried=32, reward={"harm": 1.0, "objective": "own"})
     model = new_model(recipe, PAIR)
     states, seen = model.rows.episode.take(np.arange(8)), model._last_obs
-    tried = model.try_out(Visited(model.lines[0], seen, states))
+    tried = model.try_out(Visited(seen, states))
     gradients = tried.gradient.numpy()
     assert len(tried.seen) == 16 and np.abs(gradients).max() > (0.1 if limit > 1.0 else 0.0)
     assert np.abs(gradients).max() <= np.float32(limit)
     row = int(np.abs(gradients).argmax())
     (place,) = np.flatnonzero((seen == tried.seen[row].numpy()).all(axis=1))
-    game, gained = model.lines[0].game, []
+    game, gained = model.rows.game, []
     for offset in (1e-4, -1e-4):
         now, total = states.take([place // 2]), 0.0
         for number in range(200):
@@ -71,39 +70,25 @@ def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> 
     assert eb.make_agent(f"vine@{tmp_path / 'run'}").name == f"vine@{tmp_path / 'run'}"
 
 
-PLAN = VINE.replace(observation=["own", "plan", "role"], network={"policy": [8, 6, 5], "initial_action": "plan.action"})
-
-
-def test_network__begins_as_a_feature_exactly_and_can_learn_from_all_others() -> None:
-    torch.manual_seed(0)
-    actor = Actor(["own.speed", "plan.action", "own.mass"], PLAN)
-    observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
-    np.testing.assert_array_equal(actor.means(observations), observations[:, 1])
-    actor.descend((actor.learning(torch.from_numpy(observations)) ** 2).mean(), 0.5)
-    assert np.count_nonzero(linear_layers(actor.learning)[-1].weight.detach().numpy()) == 5
-
-
-@pytest.mark.parametrize(
-    ("network", "message"),
-    [
-        ({"initial_action": "own.speed"}, "initial_action = own.speed: must be one feature with scale 1 and a range"),
-        ({"activation": "tanh"}, "activation = tanh: must be relu for the network to begin as plan.action"),
-        ({"policy": [8, 1]}, "policy = [8, 1]: needs 2 units in every layer for the network to begin as plan.action"),
-    ],
-)
-def test_network__that_cannot_begin_as_the_feature_is_refused(network: dict[str, Any], message: str) -> None:
-    with refused(f"network.{message}"):
-        PLAN.replace(network={"policy": [8], "initial_action": "plan.action"} | network)
-
-
 def test_first_action__is_given_by_one_key() -> None:
-    with refused("network.initial_action = -0.5: must be left out, or name a feature, beside the key start"):
-        VINE.replace(start="universal", network={"policy": [8], "initial_action": -0.5})
+    with refused("network.initial_action = -0.5: must be left out beside the key start, whose policy gives the first"):
+        VINE.replace(start="ppo", network={"policy": [8], "initial_action": -0.5})
 
 
-def test_network__needs_the_feature_that_it_begins_as() -> None:
-    with refused("recipe 'vine': the observation lacks the feature plan.action, which network.initial_action names"):
-        new_model(PLAN.replace(observation=["own"]))
+def test_first_action__is_a_number_and_nearly_what_the_network_does() -> None:
+    recipe = VINE.replace(network={"policy": [8, 6], "initial_action": -0.9})
+    observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    means = Actor(["own.speed", "own.force", "own.mass"], recipe).means(observations)
+    assert means == pytest.approx(np.full(50, -0.9), abs=0.1) and len(set(means)) == 50
+    with refused("network.initial_action = plan.action: must be a number"):
+        VINE.replace(network={"policy": [8], "initial_action": "plan.action"})
+
+
+def test_start__needs_the_layers_and_the_features_of_its_policy() -> None:
+    with refused("recipe 'vine': network.policy_hidden is (8,), but must be (128, 128), as in the policy that the key"):
+        new_model(VINE.replace(start="ppo"))
+    with refused("recipe 'vine': the observation lacks the features front_1.known"):
+        new_model(STILL.replace(observation=["own", "rear_1"]))
 
 
 def test_wider_policy__keeps_the_weights_of_its_features_in_their_new_places() -> None:

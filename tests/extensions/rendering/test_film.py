@@ -57,9 +57,9 @@ def test_film__plays_in_real_time_and_ends_with_the_longest(ending: str, tmp_pat
 
 @pytest.mark.slow
 def test_watch__makes_the_film_of_the_readme(ethbrake: Command, empty_folder: Path) -> None:
-    pytest.importorskip("ethbrake_marl.extensions.forecasts")  # which `universal` observes
+    pytest.importorskip("ethbrake_marl.extensions.forecasts")  # of which `plan` is
     file = DOCS / "figures" / "emergency.gif"
-    answer = ethbrake("watch", "--agents", "full_brake,universal", "--output", "now.gif")
+    answer = ethbrake("watch", "--agents", "full_brake,plan", "--output", "now.gif")
     assert (answer.status, answer.out, answer.err) == (0, "", "film: now.gif\n")
     now, then = map(frames, (Path("now.gif"), file))
     # Pillow 11.3 draws 0.1 % of the points otherwise than Pillow 13; with another agent 3 % are others.
@@ -68,7 +68,7 @@ def test_watch__makes_the_film_of_the_readme(ethbrake: Command, empty_folder: Pa
 
 def test_readme_film__shows_every_impact() -> None:
     pytest.importorskip("ethbrake_marl.extensions.forecasts")
-    for agent, speeds in (("full_brake", ["2.4", "5.3"]), ("universal", ["3.4", "0.5"])):
+    for agent, speeds in (("full_brake", ["2.4", "5.3"]), ("plan", ["3.4", "0.5"])):
         shown = [str(impact) for scene in scenes_of("paper-random", agent) for impact in scene.impacts]
         assert [text.split(" at ")[1] for text in dict.fromkeys(shown)] == [f"{speed} m/s" for speed in speeds]
         assert all(shown.count(text) >= 7 for text in shown)  # 0.3 s each

@@ -140,7 +140,7 @@ def test_early_impacts__are_refused() -> None:
         eb.evaluate(early, "full_brake", episodes=3, harm_count="first")
 
 
-@pytest.mark.parametrize("agent", ["ppo+step", "best_harm", "universal"])
+@pytest.mark.parametrize("agent", ["ppo+step", "best_harm", "plan"])
 def test_agents__that_plan_with_exact_impacts_are_refused(agent: str) -> None:
     with refused("does not cover map, by which world 0 departs from the plain game"):
         eb.evaluate(MAPPED, agent, episodes=3, harm_count="first")
