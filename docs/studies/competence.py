@@ -9,8 +9,8 @@
 no line is a shipped scenario. ``warning`` judges the chosen rule in the shipped scenarios. Both are for a policy of the
 recipe ``three-tests`` only, which is bad in many lines. ``table`` writes docs/results/lines.csv, which compares agents
 in every shipped scenario, in lines of 2 to 8 vehicles with each position as the learner, and in 39 others, and prints
-the table of docs/findings.md. ``search`` adds the best known costs of lines that competence.json lacks. All costs are honest costs,
-means of ``WORLDS`` worlds.
+the table of docs/findings.md. ``search`` adds the best known costs of lines that competence.json lacks. All costs are
+honest costs, means of ``WORLDS`` worlds.
 """
 
 from __future__ import annotations
