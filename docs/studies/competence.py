@@ -8,9 +8,9 @@
 ``rule`` counts, for several rules, in how many lines the rule is right that a policy is worse than a rule-based agent;
 no line is a shipped scenario. ``warning`` judges the chosen rule in the shipped scenarios. Both are for a policy of the
 recipe ``three-tests`` only, which is bad in many lines. ``table`` writes docs/results/lines.csv, which compares agents
-in every shipped scenario, and in lines of 2 to 8 vehicles with each position as the learner, and prints the table of
-docs/findings.md. ``search`` adds the best known costs of lines that competence.json lacks. All costs are honest costs,
-means of ``WORLDS`` worlds.
+in every shipped scenario, in lines of 2 to 8 vehicles with each position as the learner, and in 39 others, and prints
+the table of docs/findings.md. ``search`` adds the best known costs of lines that competence.json lacks. All costs are
+honest costs, means of ``WORLDS`` worlds.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ BEST = Path(__file__).with_suffix(".json")  # line -> best known honest cost
 TABLE = Path(__file__).parents[1] / "results" / "lines.csv"
 NO_COST, NO_GAIN = 0.1, 1.01  # best known costs below this (m2/s2), or by less than this factor below full braking's
 MORE, MORE_COST = 1.02, 0.05  # an agent is worse if its cost is above the other's by this factor, and this cost (m2/s2)
+TOLD = ["place", "speed", "acceleration", "braking_capacity", "latency", "mass", "plan"]
 GROUPS = ("one learner", "several learners", "the channel hides values")
 
 
@@ -135,10 +136,22 @@ def places() -> Iterator[tuple[str, eb.Scenario]]:
             yield f"{place} of {vehicles}", line(vehicles, place)
 
 
+def telling() -> Iterator[tuple[str, eb.Scenario]]:
+    """Shipped lines of several learners, who also tell their plans."""
+    for name, scenario in shipped().items():
+        channel = scenario.v2x.model_dump(exclude_none=True)
+        if len(scenario.learners) > 1 and "tells" not in channel:
+            yield f"{name}, plans told", scenario.replace(v2x={**channel, "tells": TOLD})
+
+
+def every_line() -> dict[str, eb.Scenario]:
+    return {**shipped(), **dict(telling()), **dict(places()), **lines()}
+
+
 def search() -> None:
     """Search the least cost of the lines that ``BEST`` lacks, starting also from the agents' commands."""
     known = json.loads(BEST.read_text())
-    for name, scenario in (*shipped().items(), *places()):
+    for name, scenario in every_line().items():
         if name not in known:
             game = open_game(scenario)[1]
             teams = make_teams(",".join((*RIVALS, AGENT)), scenario, harm_count="honest").values()
@@ -175,7 +188,7 @@ def row_of(scenario: eb.Scenario, least: float) -> dict[str, Any]:
 def table() -> None:
     """Write ``TABLE``, and print the table of the page. Lines in which all agents cost the same are one line."""
     best, rows = json.loads(BEST.read_text()), {}
-    for name, scenario in (*shipped().items(), *places()):
+    for name, scenario in every_line().items():
         row = row_of(scenario, best[name])
         if not any(all(row[agent] == other[agent] for agent in (*RIVALS, AGENT)) for other in rows.values()):
             rows[name] = row

@@ -1,1 +1,1 @@
-"""Shields that do not know the true world: ``robust`` reckons with ranges, ``estimated`` with what was received."""
+"""The shield ``robust``, which reckons with ranges; and ``plan:estimated``, which plans for lines that are possible."""

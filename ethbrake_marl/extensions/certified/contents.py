@@ -1,3 +1,3 @@
 """Contents of this extension: group -> name -> module of this folder and object."""
 
-CONTENTS = {"shields": {"robust": "robust:ROBUST", "step.estimated": "estimating:ESTIMATED_STEP"}}
+CONTENTS = {"agents": {"plan.estimated": "estimating:AGENT"}, "shields": {"robust": "robust:ROBUST"}}

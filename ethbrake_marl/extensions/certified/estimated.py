@@ -1,8 +1,9 @@
-"""What one vehicle can know of its line: its *median line*, made from its messages and the scenario's ranges.
+"""What one vehicle can know of its line: *possible lines*, made from its messages and the scenario's ranges.
 
-A value of another vehicle that has not been received is the median of its range. The median line is simulated in
-parallel with the episode, from the alert on, with the vehicle's own actions; the others follow their scripts. Where
-received or measured values differ, they replace assumed ones. Nothing else of the true state is read.
+A value of another vehicle that has not been received is drawn from its range: a fixed Latin hypercube, the same for
+each world and batch. The possible lines are simulated in parallel with the episode, from the alert on, with the
+vehicle's own actions; the others follow their scripts. Received and measured values replace assumed ones. Nothing else
+of the true state is read.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.departures import SHOWN
-from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.messages.belief import known_pieces
@@ -34,6 +34,7 @@ from ethbrake_marl.extensions.messages.links import (
     newest_samples,
     present,
 )
+from ethbrake_marl.extensions.messages.reports import chances
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.interval import solo
 from ethbrake_marl.motion.layout import (
@@ -57,11 +58,12 @@ from ethbrake_marl.motion.layout import (
     Floats,
 )
 from ethbrake_marl.worlds.channel import PER_LINK
+from ethbrake_marl.worlds.counters import Numbers
+from ethbrake_marl.worlds.quantities import NEWS
 from ethbrake_marl.worlds.roles import HOLDING_SCRIPTS, LEARNER, first_command
 from ethbrake_marl.worlds.sampling import draw_once
 from ethbrake_marl.worlds.scenario import Scenario
 
-SURPRISE = 1e-6  # by which a quantity (SI units, t) may differ from its prediction: messages are moved on with rounding
 PIECE_OF_CAR_ROW = {  # rows of `State.car` -> the piece of a message that tells them
     BRAKING: P_BRAKING,
     DRIVING: P_BRAKING,
@@ -107,24 +109,33 @@ class News(NamedTuple):
         return speed, way
 
 
-class MedianLine(NamedTuple):
-    """The line that the vehicle ``body`` assumes before it has received anything: medians of all ranges."""
+class PossibleLines(NamedTuple):
+    """The M lines that the vehicle ``body`` assumes before it has received anything; or M lines for each of n worlds.
+
+    In arguments and results, rows belong to lines: first the M lines of world 0.
+    """
 
     body: int
-    alert: State  # [1] at the alert
-    news_s: Floats  # [1, N + 1] when each vehicle receives the alert (s)
+    alert: State  # [n M] at the alert
+    news_s: Floats  # [n M, N + 1] when each vehicle receives the alert (s)
     roles: tuple[str, ...]  # of the vehicles, front to rear
 
     @classmethod
-    def of(cls, scenario: Scenario, body: int) -> MedianLine:
-        """Median line of the vehicle ``body`` in a scenario. Raises the errors of ``check_predictable``."""
+    def of(cls, scenario: Scenario, body: int, M: int) -> PossibleLines:
+        """M possible lines, M = 1: that of all medians. Raises the errors of ``check_predictable``."""
         check_predictable(scenario, body)
-        N = scenario.vehicles
-        alert = draw_once(scenario, lambda width, stream: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
-        news = np.zeros((1, N + 1))
-        news[:, 1:] = scenario.v2x.news(np.zeros((1, N)), np.full((1, PER_LINK * N * N), 0.5), scenario.unheard())[0]
+        N, numbers = scenario.vehicles, hypercube(M)
+        alert = draw_once(scenario, numbers, np.zeros(M, np.int64)).worlds._replace(memories={})
+        news = np.zeros((M, N + 1))
+        links = numbers(PER_LINK * N * N, NEWS)
+        news[:, 1:] = scenario.v2x.news(np.zeros((M, N)), links, scenario.unheard())[0]
         alert.car[:, LATENCY] = np.maximum(alert.car[:, OWN_LATENCY], news)
         return cls(body, alert, news, tuple(scenario.roles.values()))
+
+    def for_worlds(self, n: int) -> PossibleLines:
+        return self._replace(
+            alert=self.alert.take(np.tile(np.arange(self.alert.n), n)), news_s=np.tile(self.news_s, (n, 1))
+        )
 
     def commands(self, car: Floats, wanted: Floats) -> Floats:
         """Commands of all bodies, [n, N + 1] m/s2 (body 0: the obstacle).
@@ -138,8 +149,7 @@ class MedianLine(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Median lines at the alert with what the vehicle knows at the first decision ``state``, one for each world of
-        ``alert``.
+        """Lines at the alert with what the vehicle knows at the first decision ``state``.
 
         Vehicles that are completely known by then start as in ``alert``, and so do the gaps between them. Raises
         ``InvalidInput`` for worlds that depart from what the vehicle can estimate.
@@ -171,47 +181,15 @@ class MedianLine(NamedTuple):
         located[:, 0] = False
         return News(pieces, sample, located, np.where(located, sample[:, AT], 0.0))
 
-    def corrected(self, state: State, median: State) -> tuple[State, Bools]:
-        """Median lines after news, and whether they had predicted all news, [n]. ``state``: the true state."""
-        foretold = self.agrees(state, median)
-        rows = (~foretold).nonzero()[0]
-        if len(rows):
-            median = median.put(rows, self.with_received(state.take(rows), median.take(rows)))
-        return median, foretold
-
-    def agrees(self, state: State, median: State) -> Bools:
-        """Whether everything that the vehicle has received and measured is the same in the ``median`` line, [n]."""
-        news = self.received(state)
-        far = (
-            np.abs(
-                self.message_contents(median, self.received(median).sample) - self.message_contents(state, news.sample)
-            )
-            > SURPRISE
-        )
-        impacts = slice(self.body - 1, self.body + 1)
-        struck = median.line[:, HIT, impacts] != state.line[:, HIT, impacts]
-        return np.asarray(~((far & news.pieces[:, :, :P_INTENT]).any(axis=(1, 2)) | struck.any(axis=1)))
-
-    def message_contents(self, state: State, sample: Floats) -> Floats:
-        """All quantities of each body that its messages can contain, except intent and plan, [n, N + 1, P_INTENT].
-
-        Places are distances (m) from this vehicle.
-        """
-        car = state.car[:, [BRAKING, OWN_LATENCY, MASS]].copy()
-        car[:, :, 0] = 0.0
-        ego_place = sample[:, PLACE, self.body, np.newaxis]
-        motion = np.stack([sample[:, PLACE] - ego_place, sample[:, SAMPLE_SPEED], sample[:, SAMPLE_FORCE]], axis=1)
-        return np.concatenate([motion, car], axis=1).transpose(0, 2, 1)
-
-    def with_received(self, state: State, median: State) -> State:
-        """Median lines in which received values replace assumed ones; ``state`` is the true state now.
+    def with_received(self, state: State, lines: State) -> State:
+        """The ``lines`` now, with received values in place of assumed ones; ``state`` is the true state now.
 
         A received place and speed are extrapolated to the present by the sender's script, without contact. A sender
         that was not accelerating is assumed to react no earlier than at its sample. A vehicle with an unknown place
         keeps its distance to this vehicle, as far as the order of the line allows.
         """
         body, news = self.body, self.received(state)
-        line, car = median.line.copy(), median.car.copy()
+        line, car = lines.line.copy(), lines.car.copy()
         for row, piece in PIECE_OF_CAR_ROW.items():
             car[:, row, 1:] = np.where(news.pieces[:, 1:, piece], state.car[:, row, 1:], car[:, row, 1:])
         onset = self.onsets(news, car)
@@ -219,12 +197,12 @@ class MedianLine(NamedTuple):
         wanted = self.commands(car, state.wanted)
         speed, way = news.speeds_and_ways(line[:, SPEED], wanted, onset, car[:, LIMIT], state.time_s[:, np.newaxis])
         line[:, SPEED] = speed
-        line[:, GAP] = self.gaps(news, way, median, state)
-        line[:, FORCE] = self.forces(news, wanted, onset, median, state)
+        line[:, GAP] = self.gaps(news, way, lines, state)
+        line[:, FORCE] = self.forces(news, wanted, onset, lines, state)
         line[:, OF_IMPACTS, body - 1 : body + 1] = state.line[:, OF_IMPACTS, body - 1 : body + 1]
         if body > 1:
             line[:, HIT, 0] = np.where(news.pieces[:, 1, P_PLACE], news.sample[:, OBSTACLE_HIT, 1], line[:, HIT, 0])
-        return median._replace(line=line, car=car, wanted=wanted)
+        return lines._replace(line=line, car=car, wanted=wanted)
 
     def onsets(self, news: News, car: Floats) -> Floats:
         """Time from which each vehicle reacts, as this vehicle assumes, [n, N + 1] s after the alert."""
@@ -232,13 +210,13 @@ class MedianLine(NamedTuple):
         accelerates = news.with_force & (news.sample[:, SAMPLE_FORCE] != 0.0)
         return np.where(accelerates, news.at_s, np.where(news.located, later, car[:, LATENCY]))
 
-    def gaps(self, news: News, way: Floats, median: State, state: State) -> Floats:
+    def gaps(self, news: News, way: Floats, lines: State, state: State) -> Floats:
         """Gaps ahead of all vehicles as this vehicle estimates them, [n, N + 1] m, as in the row GAP of ``State.line``.
 
         Positions are those of the newest samples plus ``way`` [n, N + 1] (m), the distance driven since then; unknown
-        ones come from ``median``. Between two vehicles with samples of the present, the gap is the true one.
+        ones come from ``lines``. Between two vehicles with samples of the present, the gap is the true one.
         """
-        body, gaps = self.body, median.line[:, GAP].copy()
+        body, gaps = self.body, lines.line[:, GAP].copy()
         place = np.zeros(way.shape)  # distance from this vehicle (m)
         place[:, 2:] = -np.cumsum(gaps[:, 1:-1], axis=1)
         received = news.sample[:, PLACE] + way - news.sample[:, PLACE, [body]]
@@ -253,43 +231,39 @@ class MedianLine(NamedTuple):
         gaps[:, 0] = state.line[:, GAP, 0] if body == 1 else np.maximum(ahead - place[:, 1], 0.0)
         return gaps
 
-    def forces(self, news: News, wanted: Floats, onset: Floats, median: State, state: State) -> Floats:
+    def forces(self, news: News, wanted: Floats, onset: Floats, lines: State, state: State) -> Floats:
         """Estimated acceleration of each body by its brakes or engine, [n, N + 1] m/s2.
 
         0 before the ``onset`` (s after the alert), afterwards the command ``wanted`` (m/s2). An acceleration in a
-        sample of the present replaces both. Bodies that are not located keep theirs in ``median``.
+        sample of the present replaces both. Bodies that are not located keep theirs in ``lines``.
         """
         reacting = np.where((onset <= 0.0) | (onset < state.time_s[:, np.newaxis]), wanted, 0.0)
-        force = np.where(news.located, reacting, median.line[:, FORCE])
+        force = np.where(news.located, reacting, lines.line[:, FORCE])
         force = np.where(news.fresh(state) & news.with_force, news.sample[:, SAMPLE_FORCE], force)
         force[:, self.body] = state.line[:, FORCE, self.body]
         return force
 
 
+def hypercube(M: int) -> Numbers:
+    """Source of M numbers in (0, 1) for each place, one in each M-th part, in an order that depends on the place."""
+
+    def numbers(width: int, stream: tuple[int, ...]) -> Floats:
+        keys, hashes = np.arange(M, dtype=np.float64), np.empty((M, width))
+        chances(keys, np.full(M, float(sum(part * 1000**k for k, part in enumerate((width, *stream))))), hashes)
+        return (hashes.argsort(axis=0).argsort(axis=0) + 0.5) / M
+
+    return numbers
+
+
 def check_predictable(scenario: Scenario, body: int) -> None:
     """Raise ``InvalidInput`` if the vehicle ``body`` cannot predict the line."""
-    where = f"scenario {scenario.name!r}: estimated agents and shields need"
+    where = f"scenario {scenario.name!r}: plan:estimated needs"
     if scenario.members:
         names = ", ".join(member.name for member in scenario.members)
         raise InvalidInput(f"{where} the ranges of one scenario, but this is a mixture; give one of {names}")
-    false = [channel_key.name for channel_key in scenario.v2x.channel_keys if channel_key.name != MESSAGES_KEY]
-    if false:
-        raise InvalidInput(f"{where} messages without errors; leave {', '.join(false)} out of v2x, or use shield step")
     for vehicle, (name, role) in enumerate(scenario.roles.items(), 1):
         if vehicle != body and role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):
             raise InvalidInput(f"{where} vehicles whose commands are known, but {name} is driven by {role!r}")
-
-
-def without_channel(game: Game, median: State) -> tuple[Game, State]:
-    """Game and median lines in which every vehicle knows everything, for agents that drive in median lines.
-
-    A median line does not say when true values would be received, so each vehicle's own latency includes its wait for
-    the alert.
-    """
-    car = median.car.copy()
-    car[:, OWN_LATENCY] = car[:, LATENCY]
-    memories = {name: memory for name, memory in median.memories.items() if name != MESSAGES_KEY}
-    return game._replace(layers=()), median._replace(car=car, know=np.zeros_like(median.know), memories=memories)
 
 
 def in_order(place: Floats, known: Bools) -> Floats:

@@ -50,10 +50,10 @@ def _plans(state: State, observers: Ints, time_step_s: float) -> Floats:
     out = np.empty((state.n, len(observers), len(PLAN + FORECAST)))
     for o, body in enumerate(observers.tolist()):
         plans, costs = make_plans(
-            state, foresee(state, body), no_plans(state), np.full(state.n, np.inf), body,
+            state, foresee(state, body), no_plans(state), np.full(state.n, np.inf), np.array([body]),
             time_step_s=time_step_s, phases=PHASES, reaction_s=0.0, count=HONEST, candidates=CANDIDATES,
         )  # fmt: skip
-        plan = plans[:, :, body]
+        plan = np.where(np.isnan(plans[:, :, body]), 0.0, plans[:, :, body])  # an episode has ended
         actions = [actions_of(state, body, command) for command in plan[:, COMMANDS].T]
         changes = np.clip(plan[:, CHANGES] - state.time_s[:, np.newaxis], 0.0, LONGEST_S)
         speeds = np.sqrt(costs[:, list(COSTS)])

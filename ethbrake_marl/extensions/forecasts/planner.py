@@ -29,7 +29,7 @@ from ethbrake_marl.extensions.forecasts.phases import (
     plan_worlds,
     working_memory,
 )
-from ethbrake_marl.motion.layout import FORCE, SPEED, Floats
+from ethbrake_marl.motion.layout import FORCE, SPEED, Floats, Ints
 from ethbrake_marl.registry import Part
 
 CANDIDATES = 500  # of a decision
@@ -57,7 +57,7 @@ class Planner(Observer):
         begun_s = np.where(np.isinf(begun_s) & (force < -BRAKES_MPS2), state.time_s, begun_s)
         last[:, :, body] = memory.plan
         plans, _ = make_plans(
-            state, foresee(self.predictable(state, body), body), last, begun_s, body,
+            state, foresee(self.predictable(state, body), body), last, begun_s, np.array([body]),
             time_step_s=self.time_step_s, phases=self.phases, reaction_s=self.reaction_s, count=self.harm_count,
             candidates=self.candidates,
         )  # fmt: skip
@@ -87,7 +87,7 @@ def make_plans(
     forecast: Forecast,
     last: Floats,
     begun_s: Floats,
-    body: int,
+    team: Ints,
     *,
     time_step_s: float,
     phases: int,
@@ -95,11 +95,13 @@ def make_plans(
     count: HarmCount,
     candidates: int,
 ) -> tuple[Floats, Floats]:
-    """New plans of a vehicle, [n, PLAN_NUMBERS, N + 1], and their costs (``plan_worlds``); ``last``: its last plans.
+    """New plans, [n, PLAN_NUMBERS, N + 1], and their costs (``plan_worlds``); ``last``: the last plans.
+
+    ``team``: the vehicle that plans, then others for which it plans, too.
 
     Raises ``PhysicsError`` if a forecast fails.
     """
-    plans, costs, team = last.copy(), np.zeros((state.n, COSTS)), np.array([body])
+    plans, costs, body = last.copy(), np.zeros((state.n, COSTS)), int(team[0])
     (car, clock), moving = writable(state.car, state.clock), state.line[:, SPEED, body] != 0.0
     settings = body, phases, team, time_step_s, reaction_s
     memory, arrays = working_memory(state.vehicles + 1, phases, len(team))

@@ -50,7 +50,7 @@ def test_place_and_speed_alone() -> None:
     seen = seen_by(game, state, 2)
     check(seen, "front_1", only(FRONT, "known", "gap", "closing_speed"))
     check(seen, "rear_1", only(REAR, "known", "gap", "closing_speed"))
-    assert [seen[name] for name in each] == 2 * [1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert [seen[name] for name in each] == 2 * [1.0, 1.0, *(6 * [0.0])]
     assert seen["own.braking_capacity"] == pytest.approx(0.7)
     assert (seen["rear_1.intent"], seen["front_1.build_up_time"]) == (0.0, 0.0)
 

@@ -32,7 +32,7 @@ REFUSED = {
     "v2x.persistence = periodic: needs a channel with separate messages; use a preset": given(
         {"persistence": "periodic"}
     ),
-    "v2x.tells[0] = plce: must be place, speed, acceleration, braking_capacity, latency, mass or intent": given(
+    "v2x.tells[0] = plce: must be place, speed, acceleration, braking_capacity, latency, mass, intent or plan": given(
         {"tells": ["plce"]}
     ),
     "v2x.tells.vehicle_2[1] = 3: must be place, speed": given({"tells": {"vehicle_2": ["mass", 3]}}),

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.extensions.messages.belief import ages_s, belief_of
-from ethbrake_marl.extensions.messages.links import MESSAGES_KEY, loss_number, moved_on
+from ethbrake_marl.extensions.messages.links import MESSAGES_KEY, moved_on
+from ethbrake_marl.motion.elementary import hash_number
 from ethbrake_marl.motion.layout import GAP, HIT, SPEED
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.extensions.messages.line import LINE, played, seen_by, stepped
@@ -59,7 +60,7 @@ def test_moved_on__by_hand() -> None:
 def test_chance__is_uniform_and_of_its_own_for_every_link_and_message() -> None:
     u = np.array(
         [
-            [[loss_number(key, link, number) for number in range(40)] for link in range(9)]
+            [[hash_number(key, link, number) for number in range(40)] for link in range(9)]
             for key in (0.0, 1.0, 2.0**53 - 1)
         ]
     )

@@ -156,9 +156,6 @@ REFUSED: dict[str, Any] = {
     "it is random what the vehicles learn about each other": lambda: eb.worlds_from_table(
         v2x(noise_mps=1.0)(), {"gap_1_m": [9.0]}
     ),
-    "estimated agents and shields need messages without errors; leave reports out of v2x, or use shield step": (
-        lambda: eb.make_agent("ppo+step:estimated", scenario="messages-noisy")
-    ),
 }
 
 

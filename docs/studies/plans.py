@@ -1,0 +1,119 @@
+"""What parts of a plan are worth: phases, candidates, told plans, a joint plan, and a network on top.
+
+    python docs/studies/plans.py
+    python docs/studies/plans.py --policy runs/on-top
+
+Prints mean honest costs, and paired differences with 95 % intervals over worlds. A joint plan is one for all learners,
+of which each learner applies its own part. ``--policy`` compares a trained policy, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+import ethbrake_marl as eb
+from ethbrake_marl.agent_names import make_teams
+from ethbrake_marl.agents.team import Team, play_to_end
+from ethbrake_marl.episode.plans import COMMANDS
+from ethbrake_marl.errors import EthBrakeError
+from ethbrake_marl.extensions.forecasts.planner import Planner, foresee, make_plans, no_plans
+
+ONE = ("paper-random", "paper-random-obstacle", "realistic-truck", "benchmark-truck", "stress-wide", "benchmark-noisy")
+SEVERAL = (
+    "cooperation-4-all",
+    "cooperation-4-five",
+    "cooperation-3-pair",
+    "benchmark-blocked",
+    "cooperation-4-congested",
+)
+PIECES = ("place", "speed", "acceleration", "braking_capacity", "latency", "mass")
+WORLDS, SEED = 1_000, 111
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPlanner(Planner):
+    """Plans for its own vehicle and all other learners. Its memory is the plans of all, [n, PLAN_NUMBERS, N + 1]."""
+
+    learners: tuple[int, ...] = ()
+
+    def begin(self, alert: eb.State, body: int) -> Any:
+        return no_plans(alert)
+
+    def act(self, state: eb.State, memory: Any, body: int) -> tuple[Any, Any]:
+        team = np.array([body, *(other for other in self.learners if other != body)])
+        plans, _ = make_plans(
+            state, foresee(self.predictable(state, body), body), memory, np.full(state.n, np.inf), team,
+            time_step_s=self.time_step_s, phases=self.phases, reaction_s=0.0, count=self.harm_count,
+            candidates=self.candidates,
+        )  # fmt: skip
+        return plans[:, COMMANDS.start, body].copy(), plans
+
+
+def costs(scenario: eb.Scenario, worlds: eb.State, agent: Any) -> np.ndarray:
+    _, game = eb.open_game(scenario)
+    team = (
+        make_teams(agent, scenario)[agent]
+        if isinstance(agent, str)
+        else Team("team", dict.fromkeys(scenario.learners, agent))
+    )
+    return np.asarray(play_to_end(game, worlds, team).harm("honest"))
+
+
+def telling(scenario: eb.Scenario) -> eb.Scenario:
+    channel = scenario.v2x.model_dump(exclude_none=True)
+    return scenario.replace(v2x={**channel, "tells": [*PIECES, "plan"]})
+
+
+def show(name: str, known: dict[str, np.ndarray], base: str) -> None:
+    for label, values in known.items():
+        text = f"{name:24} {label:28} {values.mean():8.3f}"
+        if label != base:
+            difference = values - known[base]
+            half = 1.96 * difference.std(ddof=1) / np.sqrt(len(difference))
+            low, high = difference.mean() - half, difference.mean() + half
+            text += f"   minus {base}: {difference.mean():+.3f} [{low:+.3f}, {high:+.3f}]"
+        print(text, flush=True)
+
+
+def one_learner(policy: str | None) -> None:
+    for name in ONE:
+        scenario = eb.load_scenario(name)
+        worlds, plan = scenario.sample(WORLDS, SEED), eb.make_agent("plan", scenario=scenario)
+        known = {
+            agent: costs(scenario, worlds, agent) for agent in ("full_brake", "e_v2x_bm", "plan:1", "plan:2", "plan")
+        }
+        for candidates in (20, 50, 150, 2000):
+            known[f"plan, {candidates} candidates"] = costs(scenario, worlds, replace(plan, candidates=candidates))
+        if policy is not None:
+            known["a network on top"] = costs(scenario, worlds, f"policy@{policy}")
+        show(name, known, "plan")
+
+
+def several_learners() -> None:
+    for name in SEVERAL:
+        scenario = eb.load_scenario(name)
+        worlds, plan = scenario.sample(WORLDS, SEED), eb.make_agent("plan", scenario=scenario)
+        told = telling(scenario)
+        joint = JointPlanner(time_step_s=scenario.time_step_s, learners=tuple(scenario.learners))
+        known = {
+            "e_v2x_bm": costs(scenario, worlds, "e_v2x_bm"), "plan": costs(scenario, worlds, "plan"),
+            "plan:1, told": costs(told, told.sample(WORLDS, SEED), "plan:1"),
+            "plan, told": costs(told, told.sample(WORLDS, SEED), replace(plan, name="told")),
+            "joint plan": costs(scenario, worlds, joint),
+        }  # fmt: skip
+        show(name, known, "plan")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--policy", help="run of a network on top of the plan")
+    given = parser.parse_args()
+    try:
+        one_learner(given.policy)
+        several_learners()
+    except (EthBrakeError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
