@@ -134,8 +134,11 @@ def test_a_row__says_who_is_filtered_and_who_sees_through(knows: str, words: str
 
 
 def test_a_row__of_a_silent_agent_that_no_layer_filters_says_so() -> None:
-    (row,) = eb.summarise(eb.evaluate("paper-random", {"mine": Seeing("not stated")}, episodes=3))
-    assert row.about == "not stated"
+    silent = Seeing("not stated")
+    del silent.knows
+    for scenario, words in (("paper-random", "not stated"), ("messages-noisy", "not stated, filtered")):
+        (row,) = eb.summarise(eb.evaluate(scenario, {"mine": silent}, episodes=3))
+        assert row.about == words
 
 
 def test_hidden__is_old_news_and_what_messages_lack() -> None:
