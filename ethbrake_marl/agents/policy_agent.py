@@ -125,7 +125,9 @@ class LearnedAgent(RangeObserver):
         """Count of harm that the training minimised, or its name if it is not registered; None: none."""
         reward = self.policy.manifest.reward
         name = reward.get("harm_count") if reward.get("harm") else None
-        return COUNTS.get(name, name) if isinstance(name, str) else None
+        if not isinstance(name, str):
+            return None
+        return HarmCount.of(name) if name in COUNTS else name
 
     def observe(self, view: View, state: State, body: int) -> Observations:
         return observe_through(self.layers, view, state, body, self.policy.manifest.time_step_s)

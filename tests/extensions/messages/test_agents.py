@@ -103,6 +103,7 @@ def test_a_script_of_a_role__sees_the_true_state_only_if_it_claims_more(knows: s
     for _ in range(12):
         states.append(state)
         state, _ = game.step(state, np.full((6, 1), -0.3))
+    script.states = script.states[::2]  # a script is asked twice
     same = saw_the_truth(script, states)
     assert len(same) == 13 and all(same[1:]) == true
 
