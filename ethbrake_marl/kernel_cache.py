@@ -126,8 +126,20 @@ def _others_can_write(path: Path, *, may_be_sticky: bool = False) -> bool:
     is_protected = may_be_sticky and status.st_mode & stat.S_ISVTX
     owners = {status.st_uid, path.lstat().st_uid}
     return hasattr(os, "getuid") and (
-        not owners <= {0, os.getuid()} or bool(status.st_mode & 0o022 and not is_protected)
+        not owners <= {0, os.getuid()} or bool(status.st_mode & _bits_of_others(status.st_gid) and not is_protected)
     )
+
+
+def _bits_of_others(group: int) -> int:
+    """Bits of a mode that let others write; a group of the user's name without another member is the user alone."""
+    import grp
+    import pwd
+
+    try:
+        name, _, _, members = grp.getgrgid(group)
+        return 0o002 if {name, *members} == {pwd.getpwuid(os.getuid()).pw_name} else 0o022
+    except KeyError:  # without a name
+        return 0o022
 
 
 def _read(path: Path, read: Callable[[bytes], Any]) -> Any:

@@ -41,9 +41,9 @@ class Progress:
         """Such as ``total harm 24.19``; empty before the first evaluation."""
         if self.objective and "objective" in self.metrics:
             return f"{self.objective} {self.metrics['objective']:.2f}"
-        words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm", "honest_cost": "honest cost"}
-        parts = [f"{words[key]} {value:.2f}" for key, value in self.metrics.items() if key in words]
-        return ", ".join(parts[:1])
+        count = next((key for key in self.metrics if key.endswith(("_harm", "_cost"))), "")  # the one that is minimised
+        words = count.replace("_", " ").replace("first impact", "first-impact")
+        return f"{words} {self.metrics[count]:.2f}" if count else ""
 
     @property
     def measured(self) -> str:

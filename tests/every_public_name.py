@@ -51,7 +51,7 @@ class Fog(eb.ChannelKey):
 
 def weigh(count: eb.HarmCount) -> float:
     eb.register_count("pushes", [0, 1, 0, 10, 0, 0], column="pushes_cost", words="cost of pushes")
-    return float(count.weights.sum())
+    return sum(count.weights)
 
 
 def shield_of(game: eb.Game) -> eb.Shield | None:

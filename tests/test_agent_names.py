@@ -145,9 +145,7 @@ def test_a_name__belongs_to_one_agent():
 
 def test_what_is_no_agent__is_refused_with_what_it_lacks():
     register_agent("theirs", lambda argument, settings: object())
-    with pytest.raises(
-        InvalidInput, match=r"agent 'theirs' = <object object.*: has no name and no knows and no begin and no act"
-    ):
+    with pytest.raises(InvalidInput, match=r"agent 'theirs' = <object object.*: has no name and no begin and no act"):
         make_agent("theirs")
 
 
@@ -218,7 +216,7 @@ def test_agents__are_given_as_names_or_as_mappings_of_names_agents_and_vehicles(
     [
         ({"a": 3}, "agent 'a' = 3: has no name"),
         ({"a": {"vehicle": "coast"}}, "team 'a': 'vehicle': must be the name of a vehicle"),
-        ({"a": {"vehicle_2": Team("x", {})}}, "team 'a': vehicle_2 = Team.*has no knows"),
+        ({"a": {"vehicle_2": Team("x", {})}}, "team 'a': vehicle_2 = Team.*has no begin"),
         (["coast", 3], "must be a name, for instance"),
     ],
 )

@@ -117,8 +117,8 @@ def test_agents_and_shields__that_predict_are_refused(icy: eb.Scenario, spec: st
     except MissingExtra:
         pytest.skip("an optional package is missing")
     parts = [type(agent) for agent in team.drivers.values()] + [type(team.shield)]
-    plain = answer(lambda: eb.evaluate(PAPER, spec, episodes=2))
-    said = answer(lambda: eb.evaluate(icy, spec, episodes=2))
+    plain = answer(lambda: eb.evaluate(PAPER, spec, episodes=2, harm_count="total"))
+    said = answer(lambda: eb.evaluate(icy, spec, episodes=2, harm_count="total"))
     assert said == plain or "does not cover Ice, by which world 0 departs from the plain game" in said
     assert said or not predicts(*parts)
 
@@ -126,8 +126,10 @@ def test_agents_and_shields__that_predict_are_refused(icy: eb.Scenario, spec: st
 @pytest.mark.parametrize("name", measure_names())
 def test_measures__that_predict_are_refused(icy: eb.Scenario, name: str) -> None:
     measure = MEASURES[name]
-    plain = answer(lambda: eb.evaluate(PAPER, "full_brake", episodes=2, measures=name))  # the same worlds
-    said = answer(lambda: eb.evaluate(icy, "full_brake", episodes=2, measures=name))
+    plain, said = (  # the same worlds
+        answer(lambda: eb.evaluate(scenario, "full_brake", episodes=2, measures=name, harm_count="total"))  # noqa: B023
+        for scenario in (PAPER, icy)
+    )
     assert said == plain or "does not cover Ice, by which world 0 departs from the plain game" in said
     assert said or not predicts(measure.of, measure.watch)
 
@@ -135,16 +137,16 @@ def test_measures__that_predict_are_refused(icy: eb.Scenario, name: str) -> None
 @pytest.mark.parametrize("group", sorted(GROUPS))
 def test_features__that_predict_are_refused_at_the_door(icy: eb.Scenario, group: str) -> None:
     assert predicts(GROUPS[group].function) and not answer(
-        lambda: eb.parallel_env(PAPER, observation=[group]).reset(seed=7)
+        lambda: eb.parallel_env(PAPER, observation=[group], reward="total-harm").reset(seed=7)
     )
     with refused("does not cover Ice, by which world 0 departs from the plain game; departures that it covers: back"):
-        eb.parallel_env(icy, observation=[group]).reset(seed=7)
+        eb.parallel_env(icy, observation=[group], reward="total-harm").reset(seed=7)
 
 
 def test_functions__that_predict_worlds_are_refused() -> None:
     """All functions that need nothing but a game, worlds and a vehicle: proofs, closed forms and searches."""
     measures = [part for name in measure_names() for part in (MEASURES[name].of, MEASURES[name].watch)]
-    game = eb.open_game(PAPER)[1]._replace(physics=Ice())
+    game = eb.open_game(PAPER, reward="total-harm")[1]._replace(physics=Ice())
     given = {"game": game, "alert": game.marked(PAPER.sample(3, 7)), "last": game.reset(PAPER.sample(3, 7)), "body": 2}
     given["state"] = given["alert"]
     called = []
@@ -159,7 +161,7 @@ def test_functions__that_predict_worlds_are_refused() -> None:
 
 def played(physics: Any, *specs: str, measures: str = "", worlds: State | None = None) -> Any:
     """Evaluation in which the physics of the game has been replaced, without a key of the scenario."""
-    game = eb.open_game(PAPER)[1]._replace(physics=physics)
+    game = eb.open_game(PAPER, reward="total-harm")[1]._replace(physics=physics)
     teams = {spec: make_teams(spec, scenario=PAPER)[spec] for spec in specs}
     chosen = [MEASURES[name] for name in measures.split(",") if name]
     return evaluate_teams(PAPER.sample(20, 7) if worlds is None else worlds, teams, game, measures=chosen)
@@ -178,8 +180,13 @@ def test_physics__changes_what_happens_and_nothing_predicts_it() -> None:
         played(Ice(), "e_v2x_bm:pairwise")
     with refused("does not cover black ice"):
         played(Named(), "coast+step")
-    with refused("the honest cost does not cover black ice, by which world 0 departs from the plain game; departures"):
-        eb.open_game(PAPER)[1]._replace(physics=Named()).reset(PAPER.sample(2, 7)).harm("honest")
+    icy, honest = eb.open_game(PAPER, reward="total-harm")[1]._replace(physics=Named()), eb.open_game(PAPER)[1]
+    for ask in (
+        lambda: icy.reset(PAPER.sample(2, 7)).harm("honest"),
+        lambda: honest._replace(physics=Named()).reset(PAPER.sample(2, 7)),  # also pays no honest reward
+    ):
+        with refused("the honest cost does not cover black ice, by which world 0 departs from the plain game; depart"):
+            ask()
 
 
 def test_exact_physics__keeps_everything() -> None:
@@ -191,6 +198,7 @@ def test_exact_physics__keeps_everything() -> None:
         for name, values in plain[spec].items():
             np.testing.assert_array_equal(values, exact[spec][name], name)
     register_physics("same", Exact())
+    eb.open_game(PAPER.replace(physics="same"))[1].reset(PAPER.sample(2, 7))
     assert eb.record_episode(PAPER.replace(physics="same"), "full_brake").gaps_m.size
     v2x = {"preset": "nominal", **({"persistence": "periodic"} if "persistence" in CHANNEL_KEYS else {})}
     eb.parallel_env(PAPER.replace(physics="same", v2x=v2x)).reset(seed=7)

@@ -48,6 +48,20 @@ def test_time_left__is_estimated_from_a_few_per_cent_of_the_work(done: int, left
     assert capsys.readouterr().err == f"training: {done} of 1,000{left}\n"
 
 
+@pytest.mark.parametrize(
+    ("metrics", "text"),
+    [
+        ({"updates": 3, "shove_cost": 2.0, "first_impact_harm": 1.0}, "shove cost 2.00"),  # a registered count
+        ({"first_impact_harm": 1.0, "total_harm": 2.0}, "first-impact harm 1.00"),
+        ({"total_harm": 2.0, "objective": 4.0}, "cost of all 4.00"),
+        ({"collision_rate": 0.5}, ""),
+    ],
+)
+def test_harm__is_that_of_the_count_that_is_minimised(metrics: dict[str, float], text: str) -> None:
+    objective = "cost of all" if "objective" in metrics else ""
+    assert Progress("training", 1, 2, metrics, objective=objective).harm == text
+
+
 def test_harm__stands_beside_the_step_of_its_measurement(capsys) -> None:
     for steps, text in ((300, "honest cost 4.50"), (0, "honest cost 4.50 at step 0")):
         ShownProgress()(Progress("training", 300, 1_000, {"steps": steps, "honest_cost": 4.5}))

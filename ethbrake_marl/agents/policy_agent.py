@@ -107,11 +107,13 @@ class LearnedAgent(RangeObserver):
         return self.policy.manifest.training_range
 
     @property
-    def trained_for(self) -> HarmCount | None:
-        """Count of harm that the training minimised; None without harm in its reward, or for an unknown count."""
+    def trained_for(self) -> HarmCount | str | None:
+        """Count of harm that the training minimised, or its name if it is not registered; None: none."""
         reward = self.policy.manifest.reward
         name = reward.get("harm_count") if reward.get("harm") else None
-        return COUNTS[name] if isinstance(name, str) and name in COUNTS else None
+        if not isinstance(name, str):
+            return None
+        return HarmCount.of(name) if name in COUNTS else name
 
     def observe(self, view: View, state: State, body: int) -> Observations:
         return observe_through(self.layers, view, state, body, self.policy.manifest.time_step_s)

@@ -49,7 +49,7 @@ class Agent(Script, Protocol):
     def knows(self) -> str:
         """What the agent needs to know: one of the texts of ``episode.layer.KNOWLEDGE``, or ``UNSTATED``.
 
-        Layers filter what it sees unless it claims more than its vehicle receives.
+        Layers filter what it sees unless it claims more than its vehicle receives. An agent without it is ``UNSTATED``.
         """
 
 
@@ -83,9 +83,8 @@ class Team(NamedTuple):
         agents = [("minimises", getattr(agent, "harm_count", None)) for agent in self.drivers.values()]
         agents += [("trained for", getattr(agent, "trained_for", None)) for agent in self.drivers.values()]
         own = [*agents, ("bounds", getattr(self.shield, "harm_count", None))]
-        return list(
-            dict.fromkeys(f"{verb} {of.words}" for verb, of in own if isinstance(of, HarmCount) and of != count)
-        )
+        others = [(verb, of) for verb, of in own if isinstance(of, HarmCount | str) and of not in (count, count.name)]
+        return list(dict.fromkeys(f"{verb} {getattr(of, 'words', of)}" for verb, of in others))
 
     def game(self, game: Game) -> Game:
         """The game with this team's shield.
@@ -115,13 +114,13 @@ class Team(NamedTuple):
 
 def check_agent(agent: Any, where: str) -> None:
     """Raise ``InvalidInput``, beginning with ``where``, unless an agent has all attributes of ``Agent``."""
-    missing = [part for part in ("name", "knows", "begin", "act") if not hasattr(agent, part)]
+    missing = [part for part in ("name", "begin", "act") if not hasattr(agent, part)]
     if missing:
         raise InvalidInput(
-            f"{where}: has no {' and no '.join(missing)}; must be an agent, which has name, knows, begin(alert, body)"
-            " and act(state, memory, body); make one with make_agent(name), policy_agent(model) or LearnedAgent(policy)"
+            f"{where}: has no {' and no '.join(missing)}; must be an agent, which has name, begin(alert, body) and"
+            " act(state, memory, body); make one with make_agent(name), policy_agent(model) or LearnedAgent(policy)"
         )
-    check_knows(agent.knows, where)
+    check_knows(getattr(agent, "knows", UNSTATED), where)
 
 
 def check_knows(knows: Any, where: str) -> None:
@@ -141,7 +140,8 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
         raise InvalidInput(f"team = {team!r:.60}: must be a Team, for instance Team.of({{'vehicle_2': agent}}, 'mine')")
     game, alert = team.game(game), game.marked(alert)
     if game.shield is None:
-        state, drivers, actions = game.reset(alert), guard_scripts(team.drivers), np.zeros((alert.n, 0))
+        drivers = guard_scripts(team.drivers, are_agents=True)
+        state, actions = game.reset(alert), np.zeros((alert.n, 0))
         memories = {body: begin_script(agent, alert, body) for body, agent in game.agents(drivers).items()}
         state = state._replace(memories={**state.memories, **memories})
         # From the first decision on, the learners' agents decide as scripts do.

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -55,7 +55,7 @@ class HarmCount:
     """
 
     name: str
-    weights: Floats = field(compare=False)
+    weights: tuple[float, ...]  # any sequence of numbers becomes a tuple, which nobody can change
     column: str
     words: str
     requires: tuple[str, ...] = ()
@@ -79,7 +79,7 @@ class HarmCount:
                 f"{where}: requires = {self.requires!r:.60}: must be ('{EXACT_IMPACTS}',), or () if only first-impact"
                 " and total harm have a weight"
             )
-        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "weights", tuple(weights.tolist()))
 
     @staticmethod
     def of(harm_count: object, what: str = "harm_count") -> HarmCount:
@@ -88,8 +88,16 @@ class HarmCount:
             return harm_count
         if not isinstance(harm_count, str) or harm_count not in COUNTS:
             *others, last = map(repr, COUNTS)
-            raise InvalidInput(f"{what} = {harm_count!r:.60}: must be {', '.join(others)} or {last}")
+            raise InvalidInput(
+                f"{what} = {harm_count!r:.60}: must be {', '.join(others)} or {last}; your own count must be registered"
+                " first, for instance by --load FILE.py (docs/extend.md)"
+            )
         return COUNTS[harm_count]
+
+    @property
+    def weight_array(self) -> Floats:
+        """A new array of the weights, [6], for compiled functions."""
+        return np.array(self.weights)
 
     @property
     def tie_breaker(self) -> HarmCount:
@@ -97,9 +105,9 @@ class HarmCount:
         return ALL_IMPACTS if self == FIRST_IMPACTS else FIRST_IMPACTS
 
 
-FIRST_IMPACTS = HarmCount("first", np.eye(6)[OF_FIRST], "first_impact_harm", "first-impact harm")
-ALL_IMPACTS = HarmCount("total", np.eye(6)[OF_TOTAL], "total_harm", "total harm")
-HONEST = HarmCount("honest", np.array([0.0, 1.0, 1.0, 10.0, 10.0, 1.0]), "honest_cost", "honest cost", (EXACT_IMPACTS,))
+FIRST_IMPACTS = HarmCount("first", (1.0, 0.0, 0.0, 0.0, 0.0, 0.0), "first_impact_harm", "first-impact harm")
+ALL_IMPACTS = HarmCount("total", (0.0, 1.0, 0.0, 0.0, 0.0, 0.0), "total_harm", "total harm")
+HONEST = HarmCount("honest", (0.0, 1.0, 1.0, 10.0, 10.0, 1.0), "honest_cost", "honest cost", (EXACT_IMPACTS,))
 IMPACT_COUNTS = (FIRST_IMPACTS, ALL_IMPACTS)  # counts of harm alone, which tables always show
 BUILT_IN_COUNTS = (*IMPACT_COUNTS, HONEST)
 
@@ -112,10 +120,10 @@ def register_count(
     Entry points: ``ethbrake_marl.counts``. Raises ``AlreadyExists`` for a name in use, and the errors of ``HarmCount``,
     whose fields the arguments are.
     """
-    count = HarmCount(name, np.array(weights), column, words, tuple(requires))
+    count = HarmCount(name, weights, column, words, tuple(requires))  # type: ignore[arg-type]  # becomes a tuple
     if column in {other.column for other in COUNTS.loaded.values() if other.name != name}:
         raise InvalidInput(f"count {name!r}: column = {column!r}: is the column of another count; give another name")
-    COUNTS.add(name, count, lambda known: known == count and np.array_equal(known.weights, count.weights))
+    COUNTS.add(name, count, lambda known: known == count)
 
 
 COUNTS: Registry[HarmCount] = Registry(
@@ -202,5 +210,5 @@ def pair_amounts(line: Floats, count: HarmCount) -> Floats:
     ``unshared_amount``, ``conduct_amount``.
     """
     out = np.empty((3, len(line), line.shape[2]))
-    _amounts(line, count.weights, out)
+    _amounts(line, count.weight_array, out)
     return out

@@ -92,7 +92,7 @@ class Physics(Protocol):
     ...         return game._replace(physics=None).first_decision(alert)
     ...     def follow(self, game, state, actions):  # learners brake half as hard
     ...         return game._replace(physics=None).follow(state, 0.5 * actions)
-    >>> scenario, game = eb.open_game("paper-random")
+    >>> scenario, game = eb.open_game("paper-random", reward="total-harm")
     >>> game = game._replace(physics=Ice())
     >>> state, step = game.step(game.reset(scenario.sample(1, seed=7)), -np.ones((1, 1)))
     >>> state.commands_mps2[:, 1]
@@ -152,7 +152,7 @@ class Game(NamedTuple):
     def marked(self, alert: State) -> State:
         """The worlds ``alert`` with this game's horizon, scripted vehicles and departures (``episode.departures``).
 
-        Raises ``InvalidInput`` for worlds of another physics.
+        Raises ``InvalidInput`` for worlds of another physics, or in which the count of harm in the reward is undefined.
         """
         departures = departures_of(self.physics)
         require(alert, f"scenario {self.name!r}", departures, simulates=True)
@@ -160,7 +160,9 @@ class Game(NamedTuple):
         car[:, SCRIPTED, 1:] = 1.0
         car[:, SCRIPTED, self.settings.learners] = 0.0
         clock[:, HORIZON] = self.settings.horizon_s
-        return mark(alert._replace(car=car, clock=clock), departures)
+        worlds = mark(alert._replace(car=car, clock=clock), departures)
+        worlds.defined(self.settings.harm_count)
+        return worlds
 
     def reset(self, alert: State) -> State:
         """Episodes at their first decision, from worlds at the alert. Scripts decide at the alert.

@@ -164,7 +164,7 @@ def hold(
     """
     count, out = HarmCount.of(harm_count), np.empty((2, *trials.shape[:2]))
     inputs = kernel_inputs(state, wanted, bodies, trials, until_s)
-    hold_worlds(inputs, count.weights, count.tie_breaker.weights, out)
+    hold_worlds(inputs, count.weight_array, count.tie_breaker.weight_array, out)
     return out
 
 
@@ -184,7 +184,7 @@ def choose(
     harm over these states counts.
     """
     best, least = np.zeros(len(below), np.int64), below.copy()
-    choose_worlds(kernel_inputs(state, wanted, bodies, trials, until_s), count.weights, best, least)
+    choose_worlds(kernel_inputs(state, wanted, bodies, trials, until_s), count.weight_array, best, least)
     return best, least
 
 
@@ -221,5 +221,5 @@ def descend(
     """
     commands, least = np.empty(state.wanted.shape), np.empty(state.n)
     inputs = kernel_inputs(state, commands, bodies, np.empty((1, len(shares), 1)), until_s)
-    descend_worlds(inputs, shares, rounds, count.weights, np.zeros(1, np.int64), least)
+    descend_worlds(inputs, shares, rounds, count.weight_array, np.zeros(1, np.int64), least)
     return commands, least

@@ -39,7 +39,7 @@ from ethbrake_marl.motion.layout import FIRST, FORCE, IMPACTS, MASS, TOTAL, Floa
     WORLD,
 ) = range(12)  # fmt: skip
 OUT_ROWS = 12
-FIRST_WEIGHTS, TOTAL_WEIGHTS = FIRST_IMPACTS.weights, ALL_IMPACTS.weights
+FIRST_WEIGHTS, TOTAL_WEIGHTS = FIRST_IMPACTS.weight_array, ALL_IMPACTS.weight_array
 
 
 @large

@@ -154,7 +154,7 @@ def script_through(layers: tuple[Layer, ...], script: Any) -> Any:
 def agent_through(layers: tuple[Layer, ...], agent: Any) -> Any:
     """``agent`` behind all ``layers``. An agent that claims to know more (``UNFILTERED``) is unchanged."""
     if isinstance(agent, UserScript):
-        return UserScript(agent_through(layers, agent.script))
+        return UserScript(agent_through(layers, agent.script), agent.is_agent, agent.first_alerts)
     if isinstance(agent, Observer):
         return replace(agent, layers=layers)
     return agent if getattr(agent, "knows", UNSTATED) in UNFILTERED else script_through(layers, agent)

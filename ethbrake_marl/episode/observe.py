@@ -25,7 +25,7 @@ from ethbrake_marl.episode.features import (
     side_of,
 )
 from ethbrake_marl.episode.functions import call_function, check_finite_values
-from ethbrake_marl.episode.reach import row_within_reach, within_reach
+from ethbrake_marl.episode.reach import clock_of_reach, row_within_reach, within_reach
 from ethbrake_marl.episode.state import TIME, State
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacity
@@ -101,7 +101,7 @@ class View:
         plan = self.plan
         observations = np.empty((state.n, len(observers), len(self.names)), np.float32)
         observe_worlds(
-            state.line, state.car, state.clock, state.know, observers, plan.offsets, plan.role, plan.obstacle,
+            state.line, state.car, clock_of_reach(state), state.know, observers, plan.offsets, plan.role, plan.obstacle,
             plan.places, plan.scaling, np.empty(N_OWN + N_NEIGHBOUR * len(plan.offsets) + N_ROLE + N_OBSTACLE),
             observations,
         )  # fmt: skip

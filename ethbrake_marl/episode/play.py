@@ -54,7 +54,7 @@ def follow_plans(
     line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     out, settings = np.empty(len(plans)), game.settings
     play_worlds(
-        line, car, clock, wanted, plans, most, settings.learners, settings.time_step_s, count.weights,
+        line, car, clock, wanted, plans, most, settings.learners, settings.time_step_s, count.weight_array,
         scratch_for(wanted.shape[1]), out,
     )  # fmt: skip
     return State(line, car, clock, know, wanted, memories), out

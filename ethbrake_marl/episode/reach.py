@@ -1,4 +1,4 @@
-"""Who can matter: vehicles that cannot come near an observer before the episode ends read as absent."""
+"""Who can matter: vehicles that cannot come near an observer before the end, unless somebody drives, read as absent."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from ethbrake_marl.episode.state import END, TIME, State
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.layout import FAR_M, FORCE, GAP, LIMIT, MASS, RESTITUTION, SPEED, Ints
+from ethbrake_marl.motion.layout import FAR_M, FORCE, GAP, LIMIT, MASS, RESTITUTION, SPEED, Floats, Ints
 
 NEAR_M = 100.0  # vehicles within this gap always matter: features show gaps up to here
 
@@ -16,8 +16,17 @@ NEAR_M = 100.0  # vehicles within this gap always matter: features show gaps up 
 def within_reach(state: State, body: int) -> Ints:
     """First and last vehicle that can matter to ``body``, according to what ``state`` shows it, [n, 2]."""
     out = np.empty((state.n, 2), np.int64)
-    rows_within_reach(state.line, state.car, state.clock, state.know, body, out)
+    rows_within_reach(state.line, state.car, clock_of_reach(state), state.know, body, out)
     return out
+
+
+def clock_of_reach(state: State) -> Floats:
+    """The state's ``clock``; without an end if the vehicles move in another way, so that all can matter."""
+    if state.is_exact:
+        return state.clock
+    clock = state.clock.copy()
+    clock[:, END] = np.inf
+    return clock
 
 
 @large
@@ -47,9 +56,9 @@ def is_apart(line, car, clock, know, i, p):
 
     They cannot if ``gap > NEAR_M`` and ``gap > T (forward + backward)``: T is the time that is left, ``forward`` the
     largest speed behind the gap and ``backward`` the largest one, towards it, ahead of it (``largest_speeds``). So all
-    ahead may stop at once, and nobody behind need brake. The observer itself may still drive: it asks again at its
-    next decision, and sees the vehicle again while more than ``NEAR_M`` are left. What is unknown (NaN, or not yet
-    heard of) lets nobody be apart.
+    ahead may stop at once, and nobody behind need brake. But nobody may begin to drive: if the observer or another
+    vehicle does (perhaps after its latency), the observer sees the vehicle again at its next decision, while about
+    ``NEAR_M`` or more are left. What is unknown (NaN, or not yet heard of) lets nobody be apart.
     """
     gap, time = line[GAP, p], clock[TIME]
     if not gap > NEAR_M or clock[END] <= time:

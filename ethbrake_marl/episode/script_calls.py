@@ -12,37 +12,26 @@ from ethbrake_marl.errors import AgentFailed, EthBrakeError, describe_error
 from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 
-ASKED_TWICE = 8  # worlds for which a script must answer twice alike
-
 
 class UserScript:
     """Guards a script from outside this package: its states and memories are read-only, its results are checked.
 
-    Simulations share states and memories, so a script must not change either. The first alert is shown twice, because
-    a script that then answers differently would give each agent other emergencies.
+    Simulations share states and memories, so a script must not change either. In its first episodes ``begin`` and
+    ``act`` are called twice, because a script that then answers differently would give each agent other emergencies.
+    Of an agent only ``begin`` is called twice: its actions may be random.
     """
 
-    def __init__(self, script: Any) -> None:
-        self.script, self.name = script, name_of(script)
+    def __init__(self, script: Any, is_agent: bool, first_alerts: dict[int, State | None] | None = None) -> None:
+        """``first_alerts``: body -> alert of its first episodes until they are over."""
+        self.script, self.name, self.is_agent = script, name_of(script), is_agent
         self.knows, self.needs_ahead = getattr(script, "knows", None), getattr(script, "needs_ahead", ())
-        self.is_asked_twice = False
+        self.first_alerts = {} if first_alerts is None else first_alerts
 
     def begin(self, alert: State, body: int) -> Any:
-        memory = self._begin(alert, body)
-        if memory is not None and not self.is_asked_twice:
-            few = alert.take(slice(ASKED_TWICE))
-            first, second = (
-                [array.tobytes() for array in arrays_of(self._begin(few, body)) if not array.dtype.hasobject]
-                for _ in range(2)
-            )
-            if first != second:
-                raise AgentFailed(
-                    self.name,
-                    None,
-                    f"vehicle_{body}: begin answers differently for the same worlds; must draw random numbers from"
-                    " alert.generators(body), which are the same for every agent",
-                )
-            self.is_asked_twice = True
+        memory, is_first = self._begin(alert, body), body not in self.first_alerts
+        if is_first:
+            self._check_alike("begin", body, memory, self._begin(alert, body))
+        self.first_alerts[body] = alert if is_first and not self.is_agent else None
         return memory
 
     def _begin(self, alert: State, body: int) -> Any:
@@ -53,7 +42,21 @@ class UserScript:
         if not isinstance(answer, tuple) or len(answer) != 2:
             right = "must return commands and memory"
             raise AgentFailed(self.name, None, f"vehicle_{body}: act returned {answer!r:.60}; {right}")
+        first_alert = self.first_alerts.get(body)
+        if first_alert is not None:
+            self._begin(first_alert, body)  # a script that keeps new random numbers in the object now acts differently
+            self._check_alike("act", body, answer, self.script.act(state.read_only(), memory, body))
         return answer[0], self._read_only(answer[1], state.n, body)
+
+    def _check_alike(self, method: str, body: int, first: Any, second: Any) -> None:
+        """Raise ``AgentFailed`` if two answers differ, except in arrays of objects."""
+        if _contents(first) != _contents(second):
+            raise AgentFailed(
+                self.name,
+                None,
+                f"vehicle_{body}: {method} answers differently for the same worlds; must draw random numbers from"
+                " alert.generators(body) in begin, and keep them in its memory",
+            )
 
     def _read_only(self, memory: Any, n: int, body: int) -> Any:
         def view_of(array: Any) -> Any:
@@ -71,13 +74,18 @@ class UserScript:
         return map_arrays(view_of, memory)
 
 
-def guard_scripts(scripts: Mapping[int, Any]) -> dict[int, Any]:
+def _contents(answer: Any) -> list[Any]:
+    arrays = [array for array in arrays_of(answer) if not np.dtype(getattr(array, "dtype", float)).hasobject]
+    return [array.tobytes() if isinstance(array, np.ndarray) else repr(array) for array in arrays]
+
+
+def guard_scripts(scripts: Mapping[int, Any], *, are_agents: bool = False) -> dict[int, Any]:
     """The scripts, body -> script, with each script from outside this package in a ``UserScript``.
 
-    Scripts of this package are trusted.
+    Scripts of this package are trusted. ``are_agents``: they drive learners.
     """
     return {
-        body: script if type(script).__module__.startswith("ethbrake_marl.") else UserScript(script)
+        body: script if type(script).__module__.startswith("ethbrake_marl.") else UserScript(script, are_agents)
         for body, script in scripts.items()
     }
 

@@ -73,8 +73,8 @@ def _shaped(settings: StepSettings, discount: float, before: Floats, state: Stat
     )  # fmt: skip
     value, potentials = np.zeros((state.n, bodies - 1)), np.empty(state.n)
     shape_worlds(
-        state.line, state.car, state.clock, learners, shares, rounds, settings.harm_count.weights, working, discount,
-        before, potentials, value,
+        state.line, state.car, state.clock, learners, shares, rounds, settings.harm_count.weight_array, working,
+        discount, before, potentials, value,
     )  # fmt: skip
     return value, potentials
 

@@ -199,8 +199,8 @@ class State(NamedTuple):
 
     def harm(self, harm_count: AnyCount = HONEST) -> Floats:
         """Harm of each world so far, [n] m2/s2; ``harm_count`` is the count of harm (``episode.counts``)."""
-        count, out = self._defined(harm_count), np.empty(self.n)
-        _harm(self.line, count.weights, out)
+        count, out = self.defined(harm_count), np.empty(self.n)
+        _harm(self.line, count.weight_array, out)
         return out
 
     def pair_harm(self, harm_count: AnyCount = HONEST) -> Floats:
@@ -209,11 +209,11 @@ class State(NamedTuple):
         The pair of the obstacle and Vehicle 1 is left out. So the result lacks the harm of impacts with the obstacle
         and, in the honest cost, the price of Vehicle 1's driving and motion.
         """
-        return pair_amounts(self.line, self._defined(harm_count))[0, :, 1:-1]
+        return pair_amounts(self.line, self.defined(harm_count))[0, :, 1:-1]
 
     def borne_harm(self, harm_count: AnyCount = HONEST) -> Floats:
         """Harm that each vehicle has borne so far, [n, N] m2/s2. It sums to the harm of the line."""
-        pairs, unshared, conduct = pair_amounts(self.line, self._defined(harm_count))
+        pairs, unshared, conduct = pair_amounts(self.line, self.defined(harm_count))
         out = np.empty((self.n, self.vehicles))
         split_harm(pairs - unshared, self.car[:, MASS], out)
         return out + conduct[:, :-1]
@@ -237,7 +237,7 @@ class State(NamedTuple):
         """All counts of harm that are defined in these worlds."""
         return [count for count in all_counts() if self.defines(count)]
 
-    def _defined(self, harm_count: AnyCount) -> HarmCount:
+    def defined(self, harm_count: AnyCount) -> HarmCount:
         """The count; raises ``InvalidInput`` if it is not defined in these worlds."""
         count = HarmCount.of(harm_count)
         if not self.defines(count):

@@ -138,7 +138,7 @@ def step(
         rows: tuple[int, int] = step_worlds(
             old_line, old_clock, old_wanted, not donate, first, end, line, car, clock, wanted, actions,
             scratch_for(wanted.shape[1]), out, reward, settings.learners, settings.time_step_s, settings.harm,
-            settings.terminal, settings.harm_count.weights,
+            settings.terminal, settings.harm_count.weight_array,
         )  # fmt: skip
         return rows
 

@@ -17,7 +17,7 @@ from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.measures import HORIZON, PUSHED_FAR_M, Measure, MeasureValues, Statistic, usual_measures
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, flat_row, terminal_text
-from ethbrake_marl.worlds.quantities import QUANTITIES
+from ethbrake_marl.worlds.quantities import OPTIONAL, QUANTITIES
 
 BASELINE = "full_brake"
 SEES_THROUGH, EXPLOITS = "†", "‡"  # marks of teams
@@ -420,8 +420,9 @@ def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
 def caption(parameters: Mapping[str, Any]) -> str:
     """One line about the worlds, from ``SummaryTable.parameters``."""
     parts = []
-    for key, (symbol, unit) in SYMBOLS.items():
+    for key in (*SYMBOLS, *(key for key in OPTIONAL if key not in SYMBOLS)):
         if key in parameters:
+            symbol, unit = SYMBOLS.get(key, (key, ""))
             entries = [parameters[key]] if QUANTITIES[key].per == "world" else parameters[key]
             texts = [f"{e[0]:.3g}–{e[1]:.3g}" if isinstance(e, list) else f"{e:.4g}" for e in entries]
             value = texts[0] if len(set(texts)) == 1 else f"({f',{STAY}'.join(texts)})"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from ethbrake_marl.agent_names import AgentSettings, team_of, teams_of, wrap_team
+from ethbrake_marl.agent_names import AgentSettings, make_agent, team_of, teams_of, wrap_team
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
@@ -38,7 +38,8 @@ def shield(
     that changes actions changes what is proposed to the shield. Infos: ``shield_...`` (docs/shield.md).
 
     Args:
-        env: an environment of this package (perhaps in wrappers of its library), a ``VecEnv``, a ``Team`` or an agent.
+        env: an environment of this package (perhaps in wrappers of its library), a ``VecEnv``, a ``Team``, an agent or
+            its name.
         policy: proposes actions where the caller proposes none (NaN, or no entry in the dictionary); the shield also
             plans with them. A name, an agent for all learners, a ``Team``, or vehicle -> agent. None: without a
             proposal the shield follows its own plan.
@@ -58,9 +59,7 @@ def shield(
     True
 
     """
-    if isinstance(env, str):
-        raise InvalidInput(f"shield: {env!r:.60}: is a name; pass make_agent({env!r:.60}), or add +{mode} to the name")
-    is_agent = hasattr(env, "act")
+    is_agent = hasattr(env, "act") or isinstance(env, str)
     if not is_agent and not isinstance(env, Team) and not hasattr(env, "unwrapped"):
         raise InvalidInput(
             f"shield: {env!r:.80}: must be a team, an agent, or an environment; make an agent of a network or another"
@@ -76,7 +75,8 @@ def shield(
     around = partial(guard_team, mode=mode, scenario=worlds, count=count, options=options)
     if not is_agent and not isinstance(env, Team):
         return shielded_environment(env, base, policy, around, count)
-    team = team_of(env, worlds) if is_agent else env
+    driver: Any = make_agent(env, scenario=worlds, harm_count=count) if isinstance(env, str) else env
+    team = team_of(driver, worlds)
     if policy is not None:
         raise InvalidInput(f"shield: {team.name!r} proposes by itself; leave out policy")
     return around(team)

@@ -76,7 +76,7 @@ class NamedShield(NamedTuple):
 def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
     for body, agent in (drivers or {}).items():
         check_agent(agent, f"shield: policy of vehicle_{body} = {agent!r:.60}")
-    return guard_scripts(dict(sorted((drivers or {}).items())))
+    return guard_scripts(dict(sorted((drivers or {}).items())), are_agents=True)
 
 
 def check_drivers(game: Game, drivers: Mapping[int, Agent]) -> None:

@@ -48,7 +48,7 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
     return {
         QUANTITIES[key].column_of(i): np.minimum(column, QUANTITIES[key].high)
         for key in QUANTITIES
-        if key in USUAL or is_present.get(key)
+        if key in USUAL or is_present.get(key, key in values)
         for i, column in enumerate(values[key].T[: QUANTITIES[key].count(worlds.vehicles)])
     }
 

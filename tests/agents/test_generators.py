@@ -93,7 +93,7 @@ ALIKE: dict[str, Callable[[State, int], Any]] = {
 def test_script_that_draws_for_itself__is_refused_in_one_line(what: str) -> None:
     right = (
         r"'drawing', vehicle_3: begin answers differently for the same worlds; must draw random numbers from"
-        r" alert\.generators\(body\), which are the same for every agent$"
+        r" alert\.generators\(body\) in begin, and keep them in its memory$"
     )
     with pytest.raises(AgentFailed, match=right) as caught:
         harm(PAPER, DIFFERENT[what])
@@ -103,6 +103,54 @@ def test_script_that_draws_for_itself__is_refused_in_one_line(what: str) -> None
     _, game = game_of(PAPER, {3: Drawing(DIFFERENT[what])})
     with pytest.raises(AgentFailed, match="begin answers differently"):
         game.reset(PAPER.sample(1, 7))
+
+
+class InAct(Drawing):
+    """Draws in ``act`` what ``draw`` returns."""
+
+    def begin(self, alert: State, body: int) -> Any:
+        return None
+
+    def act(self, state: State, memory: Any, body: int) -> tuple[Any, Any]:
+        return self.draw(state, body), memory
+
+
+class InObject(InAct):
+    """Draws in ``begin`` and remembers it in the object; without a seed."""
+
+    def begin(self, alert: State, body: int) -> Any:
+        self.after = RNG.lognormal(size=alert.n)
+
+    def act(self, state: State, memory: Any, body: int) -> tuple[Any, Any]:
+        return np.where(state.time_s > self.after[: state.n], -2.0, 0.0), memory
+
+
+def rarely(n: int) -> Any:
+    return np.where(np.arange(n) == n - 1, RNG.random(n), 0.5)
+
+
+RANDOM: dict[str, tuple[str, Any]] = {
+    "in act": ("act", InAct(lambda state, body: -RNG.random(state.n))),
+    "a list": ("act", InAct(lambda state, body: [*-RNG.random(state.n)])),
+    "in act, late": ("act", InAct(lambda state, body: np.where(state.time_s < 2.0, 0.0, -RNG.random(state.n)))),
+    "in the object": ("act", InObject(lambda state, body: None)),
+    "in the last world": ("begin", Drawing(lambda alert, body: rarely(alert.n))),
+    "in act, in the last world": ("act", InAct(lambda state, body: -rarely(state.n))),
+}
+
+
+@pytest.mark.parametrize("what", RANDOM)
+@pytest.mark.parametrize("scenario", [PAPER, PAPER.replace(v2x="nominal")])
+def test_script_that_draws_out_of_sight__is_refused(scenario: eb.Scenario, what: str) -> None:
+    method, script = RANDOM[what]
+    team = eb.Team.of({"vehicle_2": eb.make_agent("full_brake")}, "x")
+    with pytest.raises(AgentFailed, match=f"'drawing', vehicle_3: {method} answers differently for the same worlds"):
+        evaluate_teams(scenario.draw(40, 7), {"x": team}, game_of(scenario, {3: script})[1])
+
+
+def test_agent__may_act_at_random() -> None:
+    mine = InAct(lambda state, body: -RNG.random(state.n))
+    assert eb.evaluate(PAPER, {"mine": mine}, episodes=5)["mine"]["honest_cost"].shape == (5,)
 
 
 @pytest.mark.parametrize("what", ALIKE)

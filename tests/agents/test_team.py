@@ -83,10 +83,7 @@ def test_a_team__drives_exactly_the_learners(drivers: Any, message: str) -> None
 @pytest.mark.parametrize(
     ("drivers", "message"),
     [
-        (
-            {"vehicle_2": "coast"},
-            "team 't': vehicle_2 = 'coast': has no name and no knows and no begin and no act; must",
-        ),
+        ({"vehicle_2": "coast"}, "team 't': vehicle_2 = 'coast': has no name and no begin and no act; must"),
         ({2: Held("full_brake")}, "team 't': 2: must be the name of a vehicle, such as vehicle_2"),
         ({"vehicle_0": Held("full_brake")}, "team 't': 'vehicle_0': must be the name of a vehicle"),
     ],

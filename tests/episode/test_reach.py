@@ -10,7 +10,7 @@ import pytest
 from ethbrake_marl.episode import features
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reach import within_reach
-from ethbrake_marl.episode.state import END, State
+from ethbrake_marl.episode.state import END, State, mark
 from ethbrake_marl.motion import layout as at
 from tests.episode.lines import later, state_of
 from tests.motion.lines import driven
@@ -67,6 +67,15 @@ def test_who_drives__may_reach_its_speed_limit_except_the_observer() -> None:
     line[:, at.FORCE, 4] = np.nan  # unknown
     assert within_reach(state._replace(line=line), 4)[0].tolist() == [4, 4]
     assert within_reach(state._replace(line=line), 2)[0].tolist() == [1, 4]
+
+
+def test_other_physics__may_bring_anybody_near() -> None:
+    """In that of the package, Vehicle 4 is too far away to matter to Vehicle 2."""
+    state = ending(state_of([8.0, 6.0, 200.0], [20.0] * 4, **USUAL), 8.0)
+    view, marked = View(["rear_2.known", "role.vehicles_behind"]), mark(state, ["wind"])
+    assert within_reach(state, 2)[0].tolist() == [1, 3] and within_reach(marked, 2)[0].tolist() == [1, 4]
+    seen = [view.observe(each, np.array([2]), 0.1)[0, 0].tolist() for each in (state, marked)]
+    assert seen[0][0] == 0.0 and seen[1][0] == 1.0 and seen[0][1] < seen[1][1]
 
 
 def test_who_is_unknown__may_be_fast() -> None:

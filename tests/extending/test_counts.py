@@ -111,6 +111,12 @@ def test_count__needs_what_it_requires() -> None:
         assert told in str(error.value) and name in str(error.value)
     with pytest.raises(InvalidInput, match=r"harm_count = 'shove': must be 'first', 'total', 'honest', .*'half'"):
         eb.make_agent("e_v2x_bm", scenario="paper-random", harm_count="shove")
+    with pytest.raises(InvalidInput, match="must be registered first, for instance by --load"):
+        eb.make_agent("e_v2x_bm", scenario="paper-random", harm_count="shove")
+    given = np.array([0.5, 0, 0, 0, 0, 0])
+    mine = eb.HarmCount("mine", given, "mine_harm", "my harm")  # type: ignore[arg-type]
+    given[0] = mine.weight_array[0] = eb.HarmCount.of("honest").weight_array[3] = 0.0
+    assert mine.weights[0] == mine.weight_array[0] == 0.5 and eb.HarmCount.of("honest").weight_array[3] == 10.0
     eb.register_count("texts", ["1", 0, 0, 0, 0, 0], column="texts_cost", words="cost of texts")  # type: ignore[list-item]
-    assert COUNTS["texts"].weights.tolist() == [1, 0, 0, 0, 0, 0]
+    assert COUNTS["texts"].weights == (1, 0, 0, 0, 0, 0)
     assert COUNTS["shoves"] == COUNTS["shoves"].of("shoves")

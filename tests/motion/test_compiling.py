@@ -1,8 +1,10 @@
 """Where machine code is stored, and that no state of its folder stops a program or makes it run other code."""
 
 import errno
+import grp
 import importlib.util
 import os
+import pwd
 import shutil
 import subprocess
 import sys
@@ -11,7 +13,7 @@ from collections.abc import Callable
 from functools import partialmethod
 from importlib.machinery import SourceFileLoader as Loader
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from unittest.mock import Mock
 
 import numba
@@ -228,7 +230,7 @@ def open_to_others(place: str, mode: int = 0o777) -> None:
 def home_is_open_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
     home = Path(os.environ["NUMBA_CACHE_DIR"]).with_name("home")
     home.mkdir(exist_ok=True)
-    home.chmod(0o775)
+    home.chmod(0o777)
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setenv("HOME", str(home))
@@ -289,13 +291,31 @@ def test_cache__is_made_for_its_user_alone_also_in_a_sticky_folder(ask: Callable
     assert folder_of(tmp_path).stat().st_mode & 0o777 == 0o700
 
 
-@pytest.mark.parametrize("mode", [0o662, 0o664])
-def test_file__that_others_can_write_is_not_run(mode: int, ask: Callable, tmp_path: Path) -> None:
+USER = pwd.getpwuid(os.getuid()).pw_name
+
+
+@pytest.mark.parametrize(
+    ("mode", "groups", "is_run"),
+    [
+        (0o662, {os.getgid(): (USER, "x", 1, [])}, False),
+        (0o664, {os.getgid(): ("staff", "x", 1, [])}, False),
+        (0o664, {os.getgid(): (USER, "x", 1, ["guest"])}, False),
+        (0o664, {}, False),  # a group without a name
+        (0o664, {os.getgid(): (USER, "x", 1, [])}, True),  # as under umask 002: the group is the user alone
+        (0o664, {os.getgid(): (USER, "x", 1, [USER])}, True),
+    ],
+)
+def test_file__that_others_can_write_is_not_run(
+    mode: int, groups: dict[int, Any], is_run: bool, ask: Callable, tmp_path: Path, monkeypatch
+) -> None:
     ask()
+    monkeypatch.setattr(grp, "getgrgid", groups.__getitem__)
     for file in folder_of(tmp_path).iterdir():
+        os.chown(file, -1, os.getgid())
         file.chmod(mode)
-    answer, compiled, (warned,) = ask()
-    assert (answer, compiled) == (42.0, 2) and "can be written by others, and is compiled again" in warned
+    answer, compiled, warned = ask()
+    assert (answer, compiled, len(warned)) == ((42.0, 0, 0) if is_run else (42.0, 2, 1))
+    assert is_run or "can be written by others, and is compiled again" in warned[0]
     assert ask() == (42.0, 0, [])
 
 

@@ -156,8 +156,12 @@ def test_teams_and_names() -> None:
     guarded = shield(team, harm_count="total", allowance=1.0)
     assert guarded.name == "coasting+step" and guarded.shield.drivers == {2: COAST}
     assert (guarded.shield.harm_count, guarded.shield.allowance) == (ALL_IMPACTS, 1.0)
-    alone = shield(COAST, scenario="paper-random", mode="episode")
-    assert alone.drivers == {2: COAST} and alone.name == "coast+episode"
+    for agent in (COAST, "coast"):
+        alone = shield(agent, scenario="paper-random", mode="episode")
+        assert alone.drivers == {2: COAST} and alone.name == "coast+episode"
+    assert shield("e_v2x_bm", scenario="paper-random", harm_count="total").drivers[2].harm_count == ALL_IMPACTS
+    with pytest.raises(InvalidInput, match="pass scenario="):
+        shield("coast")
     scenario = load_scenario("paper-random")
     teams = make_teams("ppo+step,coast+episode:pairwise", scenario, harm_count="total")
     assert [type(each.shield).__name__ for each in teams.values()] == ["StepShield", "EpisodeShield"]

@@ -254,7 +254,7 @@ def play_on(game: Game, state: State, decide: Callable[[Moment], Floats], gamma:
         gained[rows] += discount * step.reward[:, learners - 1]
         over = after.ended
         if only_harm and number >= at_least:
-            over |= stands_for_good(now, after, game.settings.harm_count.weights)
+            over |= stands_for_good(now, after, game.settings.harm_count.weight_array)
         if over.any():
             rows, after = rows[~over], after.take(~over)
         now, discount, number = after, discount * gamma, number + 1

@@ -74,7 +74,7 @@ def best_harm(
     header: dict[str, Any] = {"scenario": game.name, "vehicles": names, "budget": budget, "search_seed": seed}
     header["physics"] = physics_digest()
     header |= {} if objective == "total" else {"objective": objective}
-    header["weights"] = {count.name: count.weights.tolist() for count in counts}
+    header["weights"] = {count.name: [*count.weights] for count in counts}
     ends = [(problem.follow(profiles), profiles) for profiles in every_profile]
     best = {
         count.name: best_of([(problem.value(last, count), profiles) for last, profiles in ends]) for count in counts

@@ -215,7 +215,7 @@ class Problem(NamedTuple):
     def value(self, last: State, count: HarmCount | None = None) -> Floats:
         """What the search minimises, for episodes with the last states ``last``, [n] m2/s2."""
         value = np.empty(self.n)
-        worths(last.line, self.shares, (count or self.harm_count).weights, self.aim, value)
+        worths(last.line, self.shares, (count or self.harm_count).weight_array, self.aim, value)
         return value
 
     def values(self, profiles: Profiles) -> dict[str, Floats]:

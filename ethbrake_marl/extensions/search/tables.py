@@ -85,10 +85,10 @@ class BestHarmTable:
         A world that is not in the table has infinite harm and a profile that coasts, and so have all worlds if the
         table was made for other weights of the count.
         """
-        weights = self.header.get("weights", {}).get(count.name, count.weights.tolist())
+        weights = self.header.get("weights", {}).get(count.name, [*count.weights])
         rows = self.rows(problem.identity)
         in_table = rows >= 0
-        if count.name not in self.harm or weights != count.weights.tolist() or not in_table.any():
+        if count.name not in self.harm or weights != [*count.weights] or not in_table.any():
             return np.full(problem.n, np.inf), problem.coasting()
         ends, commands = self.profiles[count.name].take(rows)
         ends = np.where(in_table[:, np.newaxis], ends, problem.last_step[:, np.newaxis])

@@ -15,7 +15,7 @@ from ethbrake_marl.extensions.learners.vine import Moment, play_on, stands_for_g
 from ethbrake_marl.motion.layout import FORCE
 
 TEAM = ["vehicle_2", "vehicle_3"]
-FIRST = FIRST_IMPACTS.weights
+FIRST = FIRST_IMPACTS.weight_array
 
 
 def act(seen: np.ndarray) -> np.ndarray:

@@ -38,7 +38,9 @@ def test_count__is_searched_and_its_table_is_for_its_weights(tmp_path: Path, mon
     costs = {name: last.harm("shoves") for name, last in agents.items()}
     assert (costs["best_harm:60"] <= costs["e_v2x_bm"] + 1e-9).all() and (costs["e_v2x_bm"] > 0.0).any()
     assert (costs["e_v2x_bm+search"] <= costs["e_v2x_bm"]).all()
-    heavier = HarmCount("shoves", 2.0 * COUNTS["shoves"].weights, "shove_cost", "shove cost", COUNTS["shoves"].requires)
+    heavier = HarmCount(
+        "shoves", 2.0 * COUNTS["shoves"].weight_array, "shove_cost", "shove cost", COUNTS["shoves"].requires
+    )
     assert np.isinf(table.stored(problem, heavier)[0]).all()
     assert np.isinf(best_stored(problem, COUNTS["shoves"])[0]).all()
     monkeypatch.setattr(tables, "_load_shipped", lambda: (table,))
