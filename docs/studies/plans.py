@@ -31,7 +31,7 @@ SEVERAL = (
     "cooperation-4-congested",
 )
 PIECES = ("place", "speed", "acceleration", "braking_capacity", "latency", "mass")
-WORLDS, SEED = 1_000, 111
+WORLDS, SEED = 500, 111
 
 
 @dataclass(frozen=True, kw_only=True)
