@@ -106,7 +106,18 @@ def make_plans(
     settings = body, phases, team, time_step_s, reaction_s
     memory, arrays = working_memory(state.vehicles + 1, phases, len(team))
     failed = plan_worlds(
-        car, clock, moving, plans, begun_s.copy(), forecast, settings, candidates, count.weights, memory, arrays, costs
+        car,
+        clock,
+        moving,
+        plans,
+        begun_s.copy(),
+        forecast,
+        settings,
+        candidates,
+        count.weight_array,
+        memory,
+        arrays,
+        costs,
     )
     if failed >= 0:
         raise PhysicsError({failed: f"the forecast of a plan failed before the end of its {FORECAST_S:g} s"})
