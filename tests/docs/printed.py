@@ -61,7 +61,6 @@ PICTURES: dict[str, tuple[str, ...]] = {
         f"{name}.png": (f"python docs/studies/{study}.py {name}.png",)
         for name, study in (
             ("sampled-convergence", "sampling"),
-            ("price-of-not-knowing", "price"),
             ("time-gaps", "time_gaps"),
             ("regimes", "regimes"),
         )
