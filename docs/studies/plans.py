@@ -1,4 +1,4 @@
-"""What parts of a plan are worth: phases, candidates, told plans, a joint plan, and a network on top.
+"""What parts of a plan are worth: phases, candidates, told plans, a joint plan, possible lines, and a network on top.
 
     python docs/studies/plans.py
     python docs/studies/plans.py --policy runs/on-top
@@ -30,6 +30,7 @@ SEVERAL = (
     "benchmark-blocked",
     "cooperation-4-congested",
 )
+HIDDEN = ("cooperation-1-front", "cooperation-2-blocked", "benchmark-noisy", "benchmark-blocked")
 PIECES = ("place", "speed", "acceleration", "braking_capacity", "latency", "mass")
 WORLDS, SEED = 500, 111
 
@@ -108,6 +109,17 @@ def several_learners() -> None:
         show(name, known, "plan")
 
 
+def hidden_values() -> None:
+    paper = eb.load_scenario("cooperation-2-paper")
+    alone = {"no mass told": paper.replace(v2x={"preset": "nominal", "tells": PIECES[:-1]})}
+    alone["alert only"] = paper.replace(v2x={"preset": "nominal", "senses": "front", "tells": []})
+    for name, scenario in {**{name: eb.load_scenario(name) for name in HIDDEN}, **alone}.items():
+        worlds = scenario.sample(WORLDS, SEED)
+        show(
+            name, {agent: costs(scenario, worlds, agent) for agent in ("full_brake", "plan", "plan:estimated")}, "plan"
+        )
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policy", help="run of a network on top of the plan")
@@ -115,5 +127,6 @@ if __name__ == "__main__":
     try:
         one_learner(given.policy)
         several_learners()
+        hidden_values()
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
