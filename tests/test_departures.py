@@ -68,7 +68,9 @@ def icy() -> eb.Scenario:
 
 def of_form(form: str) -> set[str]:
     """Names of a form, such as ``e_v2x_bm`` and ``e_v2x_bm:pairwise`` of ``e_v2x_bm[:pairwise]``."""
-    form = re.sub(":A$", ":3", form.replace("CANDIDATES", "20").replace("INTERVALS", "gaps_m=0.5"))
+    form = re.sub(
+        ":A$", ":3", form.replace("CANDIDATES", "20").replace("INTERVALS", "gaps_m=0.5").replace("PHASES", "2")
+    )
     return {re.sub(r"\[.*?\]", "", form), form.replace("[", "").replace("]", "")}
 
 
