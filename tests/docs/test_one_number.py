@@ -15,7 +15,7 @@ AGENTS = {
     "e_v2x_bm": r"\[?E-V2X-BM \(coupled\).*|`?e_v2x_bm`?",
     "full_brake": r"full braking|`?full_brake`?|all vehicles brake fully",
     "best_harm": r"the best known.*|`?best_harm`?",
-    "plan": r"`?plan`?([:,] .*)?",
+    "plan": r"\[?`?plan`?(\]\(.*?\))?([:,] .*)?",
     "ppo": r"`?ppo`?([:,] .*trained .*)?",
 }
 CHOOSE = ("e_v2x_bm", "best_harm")  # what they do depends on what they minimise
@@ -111,7 +111,7 @@ def prose() -> Iterator[tuple[str, str]]:
 
 def test_number__of_an_agent_in_a_test_is_the_same_on_all_pages() -> None:
     found = all_facts()
-    assert len(found) > 85
+    assert len(found) > 70
     assert {key: shown for key, shown in found.items() if any(differ(a, b) for a in shown for b in shown)} == {}
 
 
