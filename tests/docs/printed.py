@@ -60,6 +60,7 @@ PICTURES: dict[str, tuple[str, ...]] = {
     **{
         f"{name}.png": (f"python docs/studies/{study}.py {name}.png",)
         for name, study in (
+            ("latency", "paper/latency"),
             ("sampled-convergence", "sampling"),
             ("price-of-not-knowing", "price"),
             ("time-gaps", "time_gaps"),
