@@ -97,7 +97,9 @@ def least_rates(episodes: int) -> dict[str, Estimate]:
 
 
 def rates_sheet(rates: Mapping[str, Estimate]) -> Sheet:
-    note = f"Exact impacts: closed form. Map: plus its difference from exact impacts in the first {MAP_WORLDS:,} worlds."
+    note = (
+        f"Exact impacts: closed form. Map: plus its difference from exact impacts in the first {MAP_WORLDS:,} worlds."
+    )
     return Sheet("Least collision rate of every strategy", ("Impacts", PERCENT), [*rates.items()], note)
 
 
