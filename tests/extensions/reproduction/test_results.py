@@ -128,6 +128,15 @@ def test_least_rate__by_hand() -> None:
         assert narrow and not wide
 
 
+def test_least_rate__by_hand_where_vehicle_3_is_near() -> None:
+    """Vehicle 2 drives away at 7 m/s2 from 0.5 s on; Vehicle 3, 4 m/s faster, brakes with 6 m/s2 from 0.8 s on."""
+    at_braking = 4.0 - 7.0 * 0.3
+    needed = 0.5 * 4.0 + 0.3 * 0.5 * (4.0 + at_braking) + at_braking**2 / (2.0 * 13.0)
+    for by, collides in ((-0.15, True), (0.15, False)):
+        keys = (("gaps_m", (90.0, needed + by)), ("speeds_mps", (20.0, 18.0, 22.0)))
+        assert map_bound.collides_in_map(STATED._replace(step_s=0.1, others=keys), 1)[0] == collides
+
+
 def test_capacities__decide_whether_harm_grows_with_the_distance() -> None:
     results = curves.capacity_results(300)
     assert [*results] == [*READINGS] and {result.verdict for result in results.values()} == {"agrees"}
