@@ -7,7 +7,7 @@ The process uses the recipes ``ppo-paper`` and ``sac-paper`` in the paper's fixe
 the random test (``random``) and at a low and a high delay. ``dense``: PPO at the low delay without terminal reward.
 ``stopped``: our recipe ``ppo``, stopped after a fifteenth of its decisions, for the paper's policy "obtained from
 training before convergence occurred". A training that was stopped goes on when the command is repeated. At the end the
-study prints each result that the trainings in the folder allow, as ``recorded.yaml`` has it. All groups take 22 hours
+study prints each result that the trainings in the folder allow, as ``recorded.yaml`` has it. All groups take 13 hours
 of one core, nearly all of it for SAC.
 
 What ``recorded.yaml`` has: ``stopped`` of 2026-12-01. The rest is of 2026-11-30, commit d6cf43def, with three of five
