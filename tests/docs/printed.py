@@ -59,7 +59,12 @@ PICTURES: dict[str, tuple[str, ...]] = {
     ),
     **{
         f"{name}.png": (f"python docs/studies/{study}.py {name}.png",)
-        for name, study in (("sampled-convergence", "sampling"), ("time-gaps", "time_gaps"), ("regimes", "regimes"))
+        for name, study in (
+            ("latency", "paper/latency"),
+            ("sampled-convergence", "sampling"),
+            ("time-gaps", "time_gaps"),
+            ("regimes", "regimes"),
+        )
     },
 }
 

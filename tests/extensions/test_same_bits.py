@@ -12,7 +12,6 @@ REMAINS = {
     ("rendering/picture.py", "math.cos"): DRAWN,
     ("rendering/picture.py", "math.sin"): DRAWN,
     ("reproduction/map_bound.py", "scipy.optimize"): SOLVED,
-    ("reproduction/map_bound.py", "scipy.sparse"): SOLVED,
 }
 
 

@@ -20,8 +20,7 @@ DRIVERS = "PPO and SAC are the shipped policies, trained on paper-random at 0.5 
 
 @dataclass(frozen=True)
 class ReproductionSettings:
-    folder: Path  # for all results and trainings
-    full: bool = False  # train by the paper's own process
+    folder: Path  # for all results
     episodes: int = PAPER_EPISODES  # largest number of worlds of an item
     tell: OnProgress = lambda progress: None
 
@@ -46,5 +45,4 @@ class Item(NamedTuple):
     title: str
     what: str
     make: Callable[[ReproductionSettings], Made]
-    most_s: float  # processor time with as many worlds as in the paper, without trainings
-    trained: tuple[str, ...] = ()  # groups of trainings; without ``full``, only what takes seconds is trained
+    most_s: float  # processor time with as many worlds as in the paper

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
@@ -11,12 +11,9 @@ from matplotlib.figure import Figure
 from ethbrake_marl.evaluation.evaluate import SEED
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_agents
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style
-from ethbrake_marl.extensions.reproduction.learning import RANDOM, courses_of, process
 from ethbrake_marl.extensions.reproduction.made import DRIVERS, DrawnFigure, Made, ReproductionSettings
-from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS
-from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
-from ethbrake_marl.extensions.reproduction.strategies import PAPERS
-from ethbrake_marl.extensions.reproduction.verdicts import Claim, Verdict
+from ethbrake_marl.extensions.reproduction.strategies import SHIPPED_SPECS
+from ethbrake_marl.extensions.reproduction.verdicts import Claim, Verdict, recorded, same_claim
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 
@@ -29,12 +26,11 @@ Records = Mapping[tuple[str, int], EpisodeRecord]  # (PPO or SAC, number of the 
 
 
 @cache
-def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Records:
-    records = {}
+def record_all(policies: tuple[tuple[str, str], ...] = (*SHIPPED_SPECS.items(),)) -> Records:
+    records: dict[tuple[str, int], EpisodeRecord] = {}
     for number in PAPER_SCENARIOS:
-        scenario = reading.only("acts_s", "rear_s").scenario(f"paper-scenario-{number}")
-        for name, record in record_agents(scenario, dict(policies), seed=SEED, harm_count="first").items():
-            records[name, number] = record
+        played = record_agents(f"paper-scenario-{number}", dict(policies), seed=SEED, harm_count="first")
+        records |= {(name, number): record for name, record in played.items()}
     return records
 
 
@@ -56,94 +52,73 @@ def road_figure(records: Records, caption: str) -> Figure:
 
 
 @in_our_style
-def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
-    """Commands of Vehicle 2 over time: one panel for each policy and scenario, with a curve for each reading."""
-    figure, all_axes = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
-    for axes, key in zip(all_axes, next(iter(curves.values())), strict=True):
+def profiles_figure(records: Records, caption: str) -> Figure:
+    """Commands of Vehicle 2 over time: one panel for each policy and scenario."""
+    figure, panels = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
+    for axes, ((name, number), record) in zip(panels, records.items(), strict=True):
         axes.axhline(0.0, color=GREY, linewidth=0.8)
-        for number, (label, records) in enumerate(curves.items()):
-            style, record = {**series_style(number), "marker": ""}, records[key]
-            command = record.command_mps2[:, VEHICLE_2_COLUMN]
-            axes.plot(record.time_s, command, drawstyle="steps-post", label=label, **style)
-        axes.set(title=f"{key[0]}, Scenario {key[1]}", ylabel="Command (m/s²)")
+        command = record.command_mps2[:, VEHICLE_2_COLUMN]
+        axes.plot(record.time_s, command, drawstyle="steps-post", **{**series_style(0), "marker": ""})
+        axes.set(title=f"{name}, Scenario {number}", ylabel="Command (m/s²)")
         axes.set(xlabel="Time since Vehicle 1 began to brake (s)")
         axes.label_outer()
-    return finish(figure, caption, all_axes[0], columns=4)
+    return finish(figure, caption)
 
 
-def all_records(settings: ReproductionSettings) -> dict[str, Records]:
-    """Recorded episodes, reading -> (policy, scenario number) -> episode.
+def positions(records: Records) -> dict[str, tuple[str, bool]]:
+    """What the paper says of Fig. 6: claim -> numbers in words, and whether it holds."""
+    smaller, larger = (policy_difference(records, k, "positions_m") for k in PAPER_SCENARIOS)
+    (ppo_1, sac_1), (ppo_2, sac_2) = (
+        [float(gap.mean()) for gap in resample_pair(records, 2, "gaps_m", pair)] for pair in (0, 1)
+    )
+    return {
+        "trajectories/alike in Scenario 1": (
+            f"root mean square {smaller:.2f} m against {larger:.2f} m", smaller < larger,
+        ),
+        "trajectories/PPO from Vehicle 3": (
+            f"mean gap {sac_2:.2f} m under SAC, {ppo_2:.2f} m under PPO", sac_2 < ppo_2,
+        ),
+        "trajectories/SAC from Vehicle 1": (
+            f"mean gap {ppo_1:.2f} m under PPO, {sac_1:.2f} m under SAC", ppo_1 < sac_1,
+        ),
+    }  # fmt: skip
 
-    Two readings: the paper's parameters as stated, and the time at which Vehicle 2 acts in the interpretation of the
-    paper whose results come nearest to the printed ones. Then, for each seed of which the paper's process has trained
-    all policies, that process. Impacts are exact in all of them.
-    """
-    policies, trained = tuple(SHIPPED_SPECS.items()), process(settings)
-    records = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
-    if [*trained] == [*SHIPPED_SPECS]:
-        for number, specs in enumerate(zip(*trained.values(), strict=False), 1):
-            records[f"{PAPERS} {number}"] = record_all(STATED, tuple(zip(trained, specs, strict=True)))
-    return records
+
+def commands(records: Records) -> dict[str, tuple[str, bool]]:
+    """What the paper says of Fig. 7: claim -> numbers in words, and whether it holds."""
+    in_1, in_2 = (policy_difference(records, k, "command_mps2") for k in PAPER_SCENARIOS)
+    (first, ppo_changes, _), (_, sac_changes, braking) = (profile_of(records[name, 2]) for name in ("PPO", "SAC"))
+    return {
+        "accelerations/alike in Scenario 1": (
+            f"root mean square difference {in_1:.2f} m/s² against {in_2:.2f} m/s²", in_1 < in_2,
+        ),
+        "accelerations/PPO accelerates": (f"first command {first:+.2f} m/s²", first > 0.0),
+        "accelerations/SAC decelerates": (
+            f"braking in {100.0 * braking:.0f} % of the time it moves", braking > 0.5,
+        ),
+        "accelerations/PPO is smoother": (
+            f"ups and downs {ppo_changes:.1f} m/s² under PPO, {sac_changes:.1f} m/s² under SAC",
+            ppo_changes < sac_changes,
+        ),
+    }  # fmt: skip
 
 
 def reproduce_trajectories(settings: ReproductionSettings) -> Made:
     """Fig. 6."""
-    readings, parts = all_records(settings), []
-    figures = []
-    for number, (name, records) in enumerate(readings.items(), 1):
-        text = f"Positions of the vehicles, {name}; an arrow every second, dashed lines join equal times."
-        figures.append(DrawnFigure(f"trajectories-{number}", f"Trajectories, {name}", text, road_figure(records, text)))
-    for records in readings.values():
-        smaller, larger = (policy_difference(records, k, "positions_m") for k in PAPER_SCENARIOS)
-        (ppo_1, sac_1), (ppo_2, sac_2) = (
-            [float(gap.mean()) for gap in resample_pair(records, 2, "gaps_m", pair)] for pair in (0, 1)
-        )
-        parts.append(
-            {
-                "alike in Scenario 1": (
-                    f"root mean square {smaller:.2f} m against {larger:.2f} m", smaller - larger,
-                ),
-                "PPO from Vehicle 3": (
-                    f"mean gap {sac_2:.2f} m under SAC, {ppo_2:.2f} m under PPO", sac_2 - ppo_2,
-                ),
-                "SAC from Vehicle 1": (
-                    f"mean gap {ppo_1:.2f} m under PPO, {sac_1:.2f} m under SAC", ppo_1 - sac_1,
-                ),
-            }
-        )  # fmt: skip
-    return Made(claims_of(parts, settings), figures=figures, notes=[DRIVERS])
+    records = record_all()
+    text = "Positions of the vehicles; an arrow every second, dashed lines join equal times."
+    figure = DrawnFigure("trajectories", "Trajectories", text, road_figure(records, text))
+    claims = [shape_claim(name, *found) for name, found in positions(records).items()]
+    return Made(claims, figures=[figure], notes=[DRIVERS])
 
 
 def reproduce_accelerations(settings: ReproductionSettings) -> Made:
     """Fig. 7."""
-    readings, parts = all_records(settings), []
-    text = "Command of Vehicle 2 over time, as the paper states the latencies and under other readings."
-    figure = DrawnFigure("accelerations", "Acceleration profiles", text, profiles_figure(readings, text))
-    for records in readings.values():
-        in_1, in_2 = (policy_difference(records, k, "command_mps2") for k in PAPER_SCENARIOS)
-        (first, ppo_changes, _), (_, sac_changes, braking) = (profile_of(records[name, 2]) for name in ("PPO", "SAC"))
-        # statement -> (what we measured, a number below 0 if the statement holds)
-        parts.append(
-            {
-                "alike in Scenario 1": (
-                    f"root mean square difference {in_1:.2f} m/s² against {in_2:.2f} m/s²", in_1 - in_2,
-                ),
-                "PPO accelerates": (f"first command {first:+.2f} m/s²", -first),
-                "SAC decelerates": (
-                    f"braking in {100.0 * braking:.0f} % of the time it moves", 0.5 - braking,
-                ),
-                "PPO is smoother": (
-                    f"ups and downs {ppo_changes:.1f} m/s² under PPO, {sac_changes:.1f} m/s² under SAC",
-                    ppo_changes - sac_changes,
-                ),
-            }
-        )  # fmt: skip
+    records = record_all()
+    text = "Command of Vehicle 2 over time."
+    figure = DrawnFigure("accelerations", "Acceleration profiles", text, profiles_figure(records, text))
     rows = [
-        (
-            *(name, str(number), policy, first),
-            *(float(record.command_mps2[:, VEHICLE_2_COLUMN].min()), braking, changes),
-        )
-        for name, records in readings.items()
+        (str(number), policy, first, float(record.command_mps2[:, VEHICLE_2_COLUMN].min()), braking, changes)
         for (policy, number), record in records.items()
         for first, changes, braking in (profile_of(record),)
     ]
@@ -154,8 +129,9 @@ def reproduce_accelerations(settings: ReproductionSettings) -> Made:
         Column("Ups and downs", digits=1),
     )
     note = "Commands of Vehicle 2 in m/s². One world each: no intervals."
-    sheet = Sheet("Commands of Vehicle 2", ("Reading", "Scenario", "Policy", *numbers), rows, note)
-    return Made(claims_of(parts, settings), [sheet], [figure])
+    sheet = Sheet("Commands of Vehicle 2", ("Scenario", "Policy", *numbers), rows, note)
+    claims = [shape_claim(name, *found) for name, found in commands(records).items()]
+    return Made(claims, [sheet], [figure])
 
 
 def resample_pair(records: Records, number: int, what: str, column: int) -> list[Floats]:
@@ -175,20 +151,14 @@ def policy_difference(records: Records, number: int, what: str) -> float:
     return float(np.sqrt(np.mean((ppo - sac) * (ppo - sac))))
 
 
-def claims_of(readings: Sequence[Mapping[str, tuple[str, float]]], settings: ReproductionSettings) -> list[Claim]:
-    """A claim agrees, or differs, if the shipped policies and all those of the paper's process say so, and else is
-    undecided. ``readings``: results with the parameters as stated, in the nearest reading and for each seed of the
-    paper's process. Each maps a claim to numbers in words, and to the smaller quantity minus the larger one.
+def shape_claim(result: str, numbers: str, holds: bool) -> Claim:
+    """A claim about one world agrees, or differs, if the shipped policies and those of the paper's process, of which
+    there are several seeds (``recorded.yaml``), all say so, and else is undecided. The same in every reading.
     """
-    courses, claims = courses_of(settings, RANDOM), []
-    decided = all(course.is_converged and course.has_interval for course in courses.values())
-    for name, (numbers, stated) in readings[0].items():
-        ours, nearest, *trained = (HOLDS[reading[name][1] < 0.0] for reading in readings)
-        seeds = f"; by the paper's process, by seed: {', '.join(trained)}" if trained else ""
-        same: Verdict = "agrees" if stated < 0.0 else "differs"
-        verdict = same if decided and {*trained} == {ours} else "undecided"
-        claims.append(Claim(name, f"{ours}: {numbers}{seeds}", nearest, verdict))
-    return claims
+    of_seeds = [HOLDS[each] for each in recorded()["seeds"][result]]
+    text = f"{HOLDS[holds]}: {numbers}; by the paper's process, by seed: {', '.join(of_seeds)}"
+    same: Verdict = "agrees" if holds else "differs"
+    return same_claim(result.split("/")[1], text, same if {*of_seeds} == {HOLDS[holds]} else "undecided")
 
 
 def profile_of(record: EpisodeRecord) -> tuple[float, float, float]:

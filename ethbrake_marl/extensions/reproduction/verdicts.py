@@ -1,8 +1,8 @@
 """Verdicts on the claims of the paper, and the table that lists them.
 
-The table's columns are: a sentence of the paper, our result with the parameters as stated, our result in the *nearest
-reading* (the interpretation of the paper that comes nearest to the printed numbers), the verdict, and a reason. People
-write the sentences and the reasons (``sentences.yaml``); the program writes results and verdicts.
+The table has a verdict for each reading of the paper (``readings``). People write the sentences and the reasons
+(``sentences.yaml``); the program writes results and verdicts. What rests on a training was measured once, by
+``docs/studies/paper/process.py``, and is read from ``recorded.yaml``.
 
 The *chance difference* is the largest difference (95 %) that chance alone causes between the means of two random lists
 of worlds: sqrt(2) times half the width of the 95 % interval. The verdict on a printed number is the first that applies:
@@ -14,58 +14,127 @@ of worlds: sqrt(2) times half the width of the 95 % interval. The verdict on a p
 
 A statement of the paper says that some quantities are smaller than others. It *agrees* if the interval of every
 difference (smaller minus larger) is below 0, is *undecided* if the remaining intervals contain 0, and else *differs*. A
-statement about a training that has not converged has no other verdict than *not converged*.
+statement about every world agrees if it holds in all of them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from ethbrake_marl.evaluation.statistics import difference, mean, rate, unpaired_difference
+from ethbrake_marl.extensions.reproduction.readings import OURS, READINGS
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.motion.layout import Bools, Floats
 
-Verdict = Literal["agrees", "differs", "cannot be", "undecided", "not converged", "not run"]
-REASONS = {"not run": "needs a training: ethbrake reproduce --full"}  # for every sentence without a reason of its own
+Verdict = Literal["agrees", "differs", "cannot be", "undecided"]
 
 VERDICT_TOLERANCE = 0.02
+SHOWN_CHARACTERS = 60  # of a sentence, in a terminal
 
 HARM, PERCENT = Column("Harm"), Column("Collision rate", digits=1, scale=100.0, unit=" %")
 DIFFERENCE = Column("Difference", sign="+")
-COLUMNS = "Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Verdict", "Why"
+
+
+class Result(NamedTuple):
+    text: str  # what we found
+    verdict: Verdict
 
 
 class Claim(NamedTuple):
     name: str  # in its item
-    ours: str  # our result with the parameters as stated
-    nearest: str  # our result in the nearest reading
-    verdict: Verdict  # on our result as stated
+    results: Mapping[str, Result]  # in each reading, or in ours alone if the reading makes no difference
+    share: str = ""  # how small the share of worlds is in which it agrees
+
+    def result(self, reading: str) -> Result:
+        return self.results.get(reading, self.results[OURS])
+
+
+def same_claim(name: str, text: str, verdict: Verdict, share: str = "") -> Claim:
+    """Claim with the same result in every reading."""
+    return Claim(name, {OURS: Result(text, verdict)}, share)
 
 
 @cache
 def paper_texts() -> Mapping[str, Any]:
-    """Content of ``sentences.yaml``: sentences of the paper with our reasons, and changes that make claims true."""
+    """Content of ``sentences.yaml``: sentences of the paper with our reasons."""
     content: Mapping[str, Any] = read_yaml(Path(__file__).with_name("sentences.yaml")).content
     return content
 
 
-def sentences_sheet(claims: Mapping[str, Mapping[str, Claim]]) -> Sheet:
-    """``claims``: item -> name -> claim. A sentence of an item that has no such claim was not run, and a sentence of
-    another item is left out.
-    """
-    rows = []
+@cache
+def recorded() -> Mapping[str, Any]:
+    """Content of ``recorded.yaml``: results that rest on a training."""
+    content: Mapping[str, Any] = read_yaml(Path(__file__).with_name("recorded.yaml")).content
+    return content
+
+
+def recorded_claim(name: str) -> Claim:
+    results = recorded()["results"][name]
+    return Claim(name, {reading: Result(**result) for reading, result in results.items()})
+
+
+class Judged(NamedTuple):
+    """A sentence of the paper, and what we found."""
+
+    where: str
+    paper: str
+    claim: Claim
+    why: str
+
+    def verdict(self, reading: str) -> str:
+        verdict = self.claim.result(reading).verdict
+        return f"{verdict} ({self.claim.share})" if self.claim.share and verdict == "agrees" else verdict
+
+
+def judge_sentences(claims: Mapping[str, Mapping[str, Claim]]) -> list[Judged]:
+    """``claims``: item -> name -> claim. Sentences of another item are left out."""
+    judged = []
     for sentence in paper_texts()["sentences"]:
-        item, name = sentence["result"].split("/")
+        item, name = sentence["result"].split("/", 1)
         if item in claims:
-            claim = claims[item].get(name, Claim(name, "", "", "not run"))
-            why = sentence["why"].get(claim.verdict, REASONS.get(claim.verdict, ""))
-            rows.append((sentence["where"], sentence["paper"], *claim[1:], why))
-    return Sheet("", [Column(heading, text=True) for heading in COLUMNS], rows)
+            claim = claims[item].get(name) or recorded_claim(sentence["result"])
+            why = sentence["why"].get(claim.result(OURS).verdict, "")
+            judged.append(Judged(sentence["where"], sentence["paper"], claim, why))
+    return judged
+
+
+def sentences_sheet(judged: Sequence[Judged]) -> Sheet:
+    """Everything: verdicts and numbers in each reading, and the reasons."""
+    headings = "Where", "The paper", *READINGS, *(f"Numbers, {reading}" for reading in READINGS), "Why"
+    rows = [
+        (
+            *(each.where, each.paper, *map(each.verdict, READINGS)),
+            *(each.claim.results[reading].text if reading in each.claim.results else "" for reading in READINGS),
+            each.why,
+        )
+        for each in judged
+    ]
+    return Sheet("", [Column(heading, text=True) for heading in headings], rows)
+
+
+def short_lines(judged: Sequence[Judged]) -> str:
+    """A line for each sentence: where it is, its beginning, and the verdicts."""
+    rows: list[tuple[str, ...]] = [("Where", "The paper", *READINGS)]
+    for each in judged:
+        cut = len(each.paper) > SHOWN_CHARACTERS
+        sentence = each.paper[: SHOWN_CHARACTERS - 1].rstrip() + "…" if cut else each.paper
+        rows.append((each.where, sentence, *(each.claim.result(reading).verdict for reading in READINGS)))
+    widths = 14, SHOWN_CHARACTERS, 9, 9, 9
+    lines = (" ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def count_sheet(judged: Sequence[Judged]) -> Sheet:
+    """How many sentences have each verdict in each reading."""
+    counts = [Counter(each.claim.result(reading).verdict for each in judged) for reading in READINGS]
+    rows = [(verdict, *(count[verdict] for count in counts)) for verdict in get_args(Verdict)]
+    return Sheet(f"Verdicts on {len(judged)} results", ("Verdict", *map(Column, READINGS)), rows)
 
 
 def chance_difference(ours: Estimate) -> float:
@@ -123,16 +192,20 @@ def judge_statement(parts: Sequence[Less]) -> tuple[str, Verdict, str]:
     return text, ("undecided" if undecided else "differs") if failing else "agrees", numbers
 
 
-def judge(name: str, stated: Sequence[Less], nearest: Sequence[Less] = (), *, numbers: str = "") -> Claim:
-    """``stated``, ``nearest``: comparisons with the parameters as stated, and in the nearest reading. ``numbers``: what
-    to show beside the result; "": the differences that decide.
-    """
-    text, verdict, details = judge_statement(stated)
-    nearest_result = judge_statement(nearest)[0] if nearest else ""
-    return Claim(name, f"{text}: {numbers or details}", nearest_result, verdict)
+def judge(parts: Sequence[Less], numbers: str = "") -> Result:
+    """``numbers``: what to show beside the result; "": the differences that decide."""
+    text, verdict, details = judge_statement(parts)
+    return Result(f"{text}: {numbers or details}", verdict)
 
 
-def judge_share(name: str, holds: Bools, of_what: str) -> Claim:
-    """Claim with our verdict on a statement about every world: *agrees* if it holds in all of them, [n]."""
-    ours = f"holds in {PERCENT.show(rate(holds)).in_words} of {len(holds):,} {of_what}" if len(holds) else ""
-    return Claim(name, ours, "", ("agrees" if holds.all() else "differs") if len(holds) else "undecided")
+def judge_in_each(name: str, of_reading: Mapping[str, Any], parts: Callable[[Any], Sequence[Less]]) -> Claim:
+    """``of_reading``: reading -> what was driven in it. ``parts``: the comparisons to make there."""
+    return Claim(name, {reading: judge(parts(driven)) for reading, driven in of_reading.items()})
+
+
+def judge_share(holds: Bools, of_what: str) -> Result:
+    """Our verdict on a statement about every world: *agrees* if it holds in all of them, [n]."""
+    if not len(holds):
+        return Result("", "undecided")
+    text = f"holds in {PERCENT.show(rate(holds)).in_words} of {len(holds):,} {of_what}"
+    return Result(text, "agrees" if holds.all() else "differs")

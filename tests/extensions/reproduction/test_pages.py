@@ -1,24 +1,23 @@
 """The pages about the reproduction: their numbers and claims are those of today's code."""
 
-import csv
 import re
 from collections import Counter
+from pathlib import Path
 from typing import get_args
 
 import pytest
 
 from ethbrake_marl import __version__
 from ethbrake_marl.extensions.report.style import picture_bytes
-from ethbrake_marl.extensions.reproduction import curves, learning, strategies, tables
 from ethbrake_marl.extensions.reproduction.items import ITEMS
-from ethbrake_marl.extensions.reproduction.learning import Course
-from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, ReproductionSettings
-from ethbrake_marl.extensions.reproduction.paper_rows import RANDOM_TEST
-from ethbrake_marl.extensions.reproduction.random_test import NON_E, SHIPPED_SPECS, report_outcome
-from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED
-from ethbrake_marl.extensions.reproduction.verdicts import REASONS, Verdict, paper_texts
+from ethbrake_marl.extensions.reproduction.made import ReproductionSettings
+from ethbrake_marl.extensions.reproduction.readings import OURS, READINGS, STATED
+from ethbrake_marl.extensions.reproduction.strategies import E_V2X_BM, NON_E, SHIPPED_SPECS, strategies, unavoidable
+from ethbrake_marl.extensions.reproduction.verdicts import Verdict, paper_texts, recorded
 from ethbrake_marl.motion.digest import physics_digest
+from tests.docs.printed import rows as rows_of_page
 from tests.docs.site import DOCS, load
+from tests.fixtures.commands import rows_of
 
 PAGE = (DOCS / "paper.md").read_text("utf-8")
 README = (DOCS.parent / "README.md").read_text("utf-8")
@@ -36,69 +35,117 @@ def test_sampling__prints_the_errors_that_the_page_tells(agent: str) -> None:
     assert picture_bytes(sampling.draw([study]), "study.png").startswith(b"\x89PNG")
 
 
-HEADING = ["Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Verdict", "Why"]
+HEADING = [
+    "Where", "The paper", *READINGS, *(f"Numbers, {reading}" for reading in READINGS), "Why",
+]  # fmt: skip
 SENTENCES = paper_texts()["sentences"]
+VERDICTS = get_args(Verdict)
 
 
-def sentences() -> list[list[str]]:
-    """The committed rows of the table of sentences, as texts."""
-    with RESULTS.open(encoding="utf-8", newline="") as file:
-        heading, *rows = csv.reader(file)
-    assert heading == HEADING
+def sentences() -> list[dict[str, str]]:
+    """The committed rows of the table of sentences."""
+    rows = rows_of(RESULTS)
+    assert [*rows[0]] == HEADING
     return rows
 
 
+def verdict_of(row: dict[str, str], reading: str) -> str:
+    return row[reading].partition(" (")[0]
+
+
 def test_results__have_every_sentence_in_the_papers_order() -> None:
-    committed = [row[:2] for row in sentences()]
+    committed = [[row["Where"], row["The paper"]] for row in sentences()]
     assert committed == [[each["where"], each["paper"]] for each in SENTENCES]
 
 
-def test_results__have_a_number_in_each_row_that_was_run_and_the_reason_for_its_verdict() -> None:
+def test_results__have_numbers_and_the_reason_for_our_verdict() -> None:
     for row, sentence in zip(sentences(), SENTENCES, strict=True):
-        *_, ours, _, verdict, why = row
-        assert re.search(r"\d", ours) or verdict == "not run"
-        assert why == sentence["why"].get(verdict, REASONS.get(verdict, "")).strip()
-        assert why or verdict == "agrees"
+        verdict = verdict_of(row, OURS)
+        assert re.search(r"\d", row["Numbers, ours"]) and all(verdict_of(row, each) in VERDICTS for each in READINGS)
+        assert row["Why"] == sentence["why"].get(verdict, "").strip()
+        assert row["Why"] or verdict == "agrees"
 
 
-COUNTED = {
-    "agrees": "agree", "differs": "differ", "cannot be": "cannot be", "undecided": "are undecided",
-    "not converged": "rest on a training that has not converged", "not run": "wait for a long training",
-}  # fmt: skip
+def counts() -> dict[str, list[int]]:
+    """Verdict -> number of rows in each reading."""
+    counted = [Counter(verdict_of(row, reading) for row in sentences()) for reading in READINGS]
+    return {verdict: [count[verdict] for count in counted] for verdict in VERDICTS}
 
 
-def test_readme__has_the_number_of_each_verdict() -> None:
-    count = Counter(row[4] for row in sentences())
-    *verdicts, last = (f"{count[verdict]} {words}" for verdict, words in COUNTED.items() if count[verdict])
-    assert f"of its {len(SENTENCES)} results, {', '.join(verdicts)}, and {last}" in " ".join(README.split())
+def test_readme_and_page__have_the_number_of_each_verdict() -> None:
+    number, text = counts(), " ".join(README.split())
+    ours, first, alone = number["agrees"]
+    assert f"Of its {len(SENTENCES)} results, {ours} agree in our own count, {first} if an episode ends" in text
+    assert f"and {alone} if each pair counts alone" in text
+    ours, first, alone = number["differs"]
+    (excluded,), (undecided,) = ({*number[verdict]} for verdict in ("cannot be", "undecided"))
+    assert f"{ours}, {first} and {alone} differ, {excluded} cannot be, {undecided} are undecided" in text
+    columns = [", ".join(str(number[verdict][k]) for verdict in VERDICTS) for k in range(len(READINGS))]
+    assert (
+        f"verdicts on all {len(SENTENCES)} results: agree, differ, cannot be, undecided | {' | '.join(columns)} |"
+        in PAGE
+    )
 
 
-def test_sentences__are_judged_by_claims_that_the_code_makes_and_no_claim_is_left_out(
-    tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    course = Course([{k: -9.0 + min(k, 3) for k in range(9)}] * 2, [{100.0: 1.0}] * 2)
-    courses = dict.fromkeys(SHIPPED_SPECS, course)
-    two_seeds = {name: [spec, spec] for name, spec in SHIPPED_SPECS.items()}
-    monkeypatch.setattr(strategies, "process", lambda settings: two_seeds)
-    for module in (curves, tables, learning):
-        monkeypatch.setattr(
-            module, "courses_of", lambda settings, delay: {"PPO": course} if delay == learning.DENSE else courses
-        )
-    for module in (curves, tables):
-        monkeypatch.setattr(module, "unconverged_policy", lambda folder: "sac")
-    settings = ReproductionSettings(tmp_path, episodes=20)
+def test_readings__change_these_verdicts_alone() -> None:
+    """The rows that the authors' own count decides; none turns back under R2."""
+    changed = {
+        sentence["result"]: [verdict_of(row, reading) for reading in READINGS]
+        for row, sentence in zip(sentences(), SENTENCES, strict=True)
+        if len({verdict_of(row, reading) for reading in READINGS}) > 1
+    }
+    both, alone, back = (
+        ["differs", "agrees", "agrees"],
+        ["differs", "differs", "agrees"],
+        ["agrees", "differs", "agrees"],
+    )
+    assert changed == {
+        "random-table/hybrid and learning": both,
+        "random-table/safety bound": both,
+        "random-table/never worse": back,
+        "random-table/expected is overall": alone,
+        f"harm-distance/{NON_E} harms most, {E_V2X_BM}": both,
+        f"harm-distance/less than {NON_E}, {E_V2X_BM}": both,
+        f"harm-distance/learning harms less, {E_V2X_BM}, predicted": both,
+        "harm-distance/lower": both,
+        "hybrid-table/outperforms in harm": both,
+    }
+
+
+def test_sentences__are_judged_by_claims_that_the_code_makes_or_that_are_recorded() -> None:
+    settings = ReproductionSettings(Path("unused"), episodes=20)
     made = {f"{item.name}/{claim.name}" for item in ITEMS for claim in item.make(settings).claims}
-    assert made == {sentence["result"] for sentence in SENTENCES}
-    verdicts = get_args(Verdict)
-    assert all(verdict in verdicts for sentence in SENTENCES for verdict in sentence["why"])
+    listed = {sentence["result"] for sentence in SENTENCES}
+    assert made | recorded()["results"].keys() == listed and not made & recorded()["results"].keys()
+    assert all(verdict in VERDICTS for sentence in SENTENCES for verdict in sentence["why"])
+    assert {result.partition("/")[0] for result in listed} == {item.name for item in ITEMS}
 
 
-def test_results__are_those_of_this_version_and_the_non_ethical_row_of_today() -> None:
+def test_results__are_those_of_this_version_and_the_numbers_of_today() -> None:
     assert f"version {__version__}, physics {physics_digest()})" in " ".join(PAGE.split())
-    stated, nearest = ({NON_E: report_outcome(NON_E, reading, PAPER_EPISODES)} for reading in (STATED, NEAREST))
-    claims = tables.number_claims(RANDOM_TEST[:1], stated, nearest, 0.0 * stated[NON_E][1], {})
-    rows = [row[2:5] for row in sentences() if row[1].startswith(f"{NON_E}, ")]
-    assert rows == [[*claim[1:]] for claim in claims]
+    outcomes = strategies(STATED, 10_000, SHIPPED_SPECS)
+    printed = [row for row in sentences() if row["Where"] == "Table III" and "average harm " in row["The paper"]]
+    rows = {row["The paper"].partition(",")[0]: row for row in printed}
+    for name in (NON_E, E_V2X_BM):
+        for reading in READINGS:
+            harm = outcomes[reading][name]["first"].mean()
+            assert rows[name][f"Numbers, {reading}"].startswith(f"{harm:.2f} [")
+    _, *table = rows_of_page("paper", "## Do the contributions hold?")
+    for name, texts in zip((NON_E, E_V2X_BM, ("PPO", "SAC"), ("Hybrid PPO", "Hybrid SAC")), table, strict=False):
+        names = (name,) if isinstance(name, str) else name
+        for reading, text in zip(READINGS, texts[1:], strict=False):
+            assert text == ", ".join(f"{outcomes[reading][each]['first'].mean():.2f}" for each in names)
+
+
+def test_page__tells_the_least_collision_rate() -> None:
+    certain = unavoidable(STATED, 10_000)
+    collided = {name: outcome["collided"] for name, outcome in strategies(STATED, 10_000, SHIPPED_SPECS)[OURS].items()}
+    needless = {name: int((rows & ~certain).sum()) for name, rows in collided.items()}
+    text = " ".join(PAGE.split())
+    assert f"In {certain.mean():.2%}".replace("%", " %") in text and f"({certain.sum():,} of 10,000)" in text
+    assert f"E-V2X-BM collides in {collided[E_V2X_BM].sum():,} worlds, so only {needless[E_V2X_BM]} of its" in text
+    assert f"collides in {collided['Hybrid PPO'].sum():,}, one more than the least" in text
+    assert (needless["Hybrid PPO"], needless["PPO"], needless[E_V2X_BM]) == (1, 5, 33)
 
 
 def test_pages__name_every_figure_and_table_of_the_paper() -> None:

@@ -5,15 +5,23 @@ import pytest
 
 from ethbrake_marl.extensions.reproduction import verdicts
 from ethbrake_marl.extensions.reproduction.items import markdown
+from ethbrake_marl.extensions.reproduction.readings import READINGS
 from ethbrake_marl.extensions.reproduction.verdicts import (
     Claim,
+    Judged,
     Less,
+    Result,
     chance_difference,
+    count_sheet,
     judge,
+    judge_in_each,
     judge_number,
+    judge_sentences,
     judge_share,
     judge_statement,
+    same_claim,
     sentences_sheet,
+    short_lines,
 )
 from ethbrake_marl.files.sheet import Estimate
 
@@ -77,37 +85,58 @@ def test_less__is_paired_in_the_same_worlds() -> None:
     assert Less.of_worlds("w", one * 0.0, other * 0.0).both_are_0 and not Less.of_worlds("w", one, one).both_are_0
 
 
-def test_claim__by_hand() -> None:
-    assert judge("x", [A], [WRONG, D]) == Claim("x", "holds: a, -3.00 [-4.00, -2.00]", "holds in 1 of 2", "agrees")
-    assert judge("x", [WRONG], numbers="1 to 2") == Claim("x", "does not hold: 1 to 2", "", "differs")
-    assert judge("x", [TIE]) == Claim("x", "nothing to compare: both are 0 in all worlds", "", "undecided")
+def test_result__by_hand() -> None:
+    assert judge([A]) == ("holds: a, -3.00 [-4.00, -2.00]", "agrees")
+    assert judge([WRONG], numbers="1 to 2") == ("does not hold: 1 to 2", "differs")
+    assert judge([TIE]) == ("nothing to compare: both are 0 in all worlds", "undecided")
+    claim = judge_in_each("x", {"ours": 2.0, "R1": -2.0}, lambda value: [Less("a", around(value, 1.0))])
+    assert [claim.result(reading).verdict for reading in READINGS] == ["differs", "agrees", "differs"]
 
 
 @pytest.mark.parametrize(
     ("holds", "expected"),
     [
-        ([True, True], ("holds in 100.0 % [34.2, 100.0] of 2 worlds", "", "agrees")),
-        ([True, False], ("holds in 50.0 % [9.5, 90.5] of 2 worlds", "", "differs")),
-        ([], ("", "", "undecided")),
+        ([True, True], ("holds in 100.0 % [34.2, 100.0] of 2 worlds", "agrees")),
+        ([True, False], ("holds in 50.0 % [9.5, 90.5] of 2 worlds", "differs")),
+        ([], ("", "undecided")),
     ],
 )
-def test_share__agrees_if_it_holds_in_every_world(holds: list[bool], expected: tuple[str, str, str]) -> None:
-    assert judge_share("s", np.array(holds, np.bool_), "worlds")[1:] == expected
+def test_share__agrees_if_it_holds_in_every_world(holds: list[bool], expected: tuple[str, str]) -> None:
+    assert judge_share(np.array(holds, np.bool_), "worlds") == expected
 
 
-def test_sentences__are_in_the_papers_order_with_the_reason_for_their_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
-    sentences = [
-        {"where": "Fig. 4", "paper": "a < b", "result": "two/x", "why": {"differs": "no", "agrees": "so it is"}},
-        {"where": "Fig. 5", "paper": "b|c", "result": "one/y", "why": {}},
-        {"where": "Fig. 2", "paper": "same", "result": "one/z", "why": {"not run": "needs --full"}},
-        {"where": "Fig. 9", "paper": "left out", "result": "three/x", "why": {}},
+SENTENCES = [
+    {"where": "Fig. 4", "paper": "a < b", "result": "two/x", "why": {"differs": "no", "agrees": "so it is"}},
+    {"where": "Fig. 5", "paper": "b|c" + " and so on" * 9, "result": "one/y", "why": {}},
+    {"where": "Fig. 2", "paper": "same", "result": "one/z", "why": {"undecided": "one seed"}},
+    {"where": "Fig. 9", "paper": "left out", "result": "three/x", "why": {}},
+]
+
+
+@pytest.fixture
+def sentences(monkeypatch: pytest.MonkeyPatch) -> list[Judged]:
+    results = {"one/z": {"ours": {"text": "7", "verdict": "undecided"}}}
+    monkeypatch.setattr(verdicts, "paper_texts", lambda: {"sentences": SENTENCES})
+    monkeypatch.setattr(verdicts, "recorded", lambda: {"results": results})
+    both = {"ours": Result("2", "differs"), "R2": Result("3", "agrees")}
+    claims = {"one": {"y": Claim("y", both)}, "two": {"x": same_claim("x", "1", "agrees", "0.3 %")}}
+    return judge_sentences(claims)
+
+
+def test_sentences__are_in_the_papers_order_with_a_verdict_in_each_reading(sentences: list[Judged]) -> None:
+    assert markdown(sentences_sheet(sentences)).splitlines() == [
+        "| Where | The paper | ours | R1 | R2 | Numbers, ours | Numbers, R1 | Numbers, R2 | Why |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| Fig. 4 | a < b | agrees (0.3 %) | agrees (0.3 %) | agrees (0.3 %) | 1 |  |  | so it is |",
+        f"| Fig. 5 | b\\|c{' and so on' * 9} | differs | differs | agrees | 2 |  | 3 |  |",
+        "| Fig. 2 | same | undecided | undecided | undecided | 7 |  |  | one seed |",
     ]
-    monkeypatch.setattr(verdicts, "paper_texts", lambda: {"sentences": sentences})
-    claims = {"one": {"y": Claim("y", "2", "3", "differs")}, "two": {"x": Claim("x", "1", "", "agrees")}}
-    assert markdown(sentences_sheet(claims)).splitlines() == [
-        "| Where | The paper | Ours, as stated | Ours, nearest reading | Verdict | Why |",
-        "| --- | --- | --- | --- | --- | --- |",
-        "| Fig. 4 | a < b | 1 |  | agrees | so it is |",
-        "| Fig. 5 | b\\|c | 2 | 3 | differs |  |",
-        "| Fig. 2 | same |  |  | not run | needs --full |",
-    ]
+
+
+def test_terminal__has_a_line_for_each_sentence_and_the_number_of_each_verdict(sentences: list[Judged]) -> None:
+    heading, first, second, _ = short_lines(sentences).splitlines()
+    assert heading.split() == ["Where", "The", "paper", "ours", "R1", "R2"]
+    assert first == f"Fig. 4         a < b{' ' * 55} agrees    agrees    agrees"
+    assert second[15:75] == "b|c and so on and so on and so on and so on and so on and s…" and len(second) < 106
+    counts = {row[0]: [*row[1:]] for row in count_sheet(sentences).rows}
+    assert counts == {"agrees": [1, 1, 2], "differs": [1, 1, 0], "cannot be": [0, 0, 0], "undecided": [1, 1, 1]}
