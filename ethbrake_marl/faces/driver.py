@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ethbrake_marl.agent_names import open_game, teams_of
-from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
+from ethbrake_marl.episode.counts import HONEST, AnyCount
 from ethbrake_marl.episode.script_calls import ask_script, begin_script, guard_scripts
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -49,20 +49,14 @@ class Driver:
         vehicle: str = "vehicle_2",
         harm_count: AnyCount = HONEST,
     ) -> None:
-        count = HarmCount.of(harm_count, "Driver: harm_count")
-        loaded, game = open_game(scenario, reward={"harm_count": count})
-        agents = agent if isinstance(agent, str) else {str(getattr(agent, "name", "agents")): agent}
-        teams = teams_of(agents, loaded, harm_count=count)
-        if len(teams) != 1:
-            raise InvalidInput(f"Driver: agent {agent!r:.80} means {len(teams)} agents; name one agent")
-        team = next(iter(teams.values()))
+        loaded, game = open_game(scenario, reward={"harm_count": harm_count})
+        team = teams_of({"driver": agent}, loaded, harm_count=harm_count)["driver"]
         if team.shield is not None:
             raise InvalidInput(
-                f"Driver: agent {team.name!r} has a shield or a search, whose bound holds only in the physics of this"
+                f"Driver: agent {agent!r:.80} has a shield or a search, whose bound holds only in the physics of this"
                 " package; name an agent without it"
             )
-        self.game = team.game(game)
-        bodies = {f"vehicle_{body}": body for body in team.drivers}
+        self.game, bodies = team.game(game), {f"vehicle_{body}": body for body in team.drivers}
         if vehicle not in bodies:
             raise unknown_name("learner", vehicle, bodies)
         self.body, self.time_step_s = bodies[vehicle], game.settings.time_step_s
@@ -103,18 +97,14 @@ class Driver:
         line, clock, wanted = before.line.copy(), before.clock.copy(), before.wanted.copy()
         measured = [
             ("time_s", clock[:, TIME], time_s),
-            ("gaps_m", line[:, GAP, 1:-1], gaps_m),
+            ("gaps_m", line[:, GAP, 1:-1], np.maximum(gaps_m, 0.0)),
             ("speeds_mps", line[:, SPEED, 1:], speeds_mps),
             ("accelerations_mps2", line[:, FORCE, 1:], accelerations_mps2),
             ("hit", line[:, HIT, 1:-1], hit),
+            ("commands_mps2", wanted[:, 1:], wanted[:, 1:] if commands_mps2 is None else commands_mps2),
+            ("obstacle_gap_m", line[:, GAP, 0], line[:, GAP, 0] if obstacle_gap_m is None else obstacle_gap_m),
+            ("obstacle_hit", line[:, HIT, 0], obstacle_hit),
         ]
-        if commands_mps2 is not None:
-            measured.append(("commands_mps2", wanted[:, 1:], commands_mps2))
-        if obstacle_gap_m is not None:
-            measured += [
-                ("obstacle_gap_m", line[:, GAP, 0], obstacle_gap_m),
-                ("obstacle_hit", line[:, HIT, 0], obstacle_hit),
-            ]
         for name, target, values in measured:
             array = np.asarray(values, np.float64)
             if array.shape not in ((), target.shape) or not np.isfinite(array).all():
@@ -127,7 +117,6 @@ class Driver:
                 f"Driver.decide: time_s = {clock[:, TIME].min():g}: must be {before.time_s.max():g} or later, the time"
                 " of the decision before (at first the time first_s)"
             )
-        np.maximum(line[:, GAP], 0.0, out=line[:, GAP])
         wanted[:, self.body] = self.command
         later = clock[:, TIME] > before.time_s
         clock[:, STEPS] += later

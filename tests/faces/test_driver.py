@@ -101,7 +101,7 @@ def test_driver__refusals() -> None:
         driver.decide(0.6, *MEASURED)
     with refused("Driver: agent 'ppo+step' has a shield or a search"):
         driver_of("ppo+step")
-    with refused("Driver: agent 'ladder' means"):
+    with refused("agent 'ladder': is the name of a group of agents"):
         driver_of("ladder")
     with refused("unknown learner 'vehicle_3'; did you mean 'vehicle_2'?"):
         driver_of(vehicle="vehicle_3")

@@ -18,54 +18,46 @@ CRITICAL_S = 1.5  # a shorter time to collision is critical (van der Horst and H
 CRITICAL_MPS2 = 3.4  # more than the comfortable deceleration of AASHTO's Green Book is critical
 
 
-def _approach(state: State) -> tuple[Floats, Floats]:
-    """Gap (m) and closing speed (m/s) of each pair, [n, N - 1]; 1 and 0 where it opens or has had an impact."""
-    closing = state.speeds_mps[:, 1:] - state.speeds_mps[:, :-1]
-    closes = ~state.pair_hit & (state.gaps_m > 0.0) & (closing > 0.0)
-    return np.where(closes, state.gaps_m, 1.0), np.where(closes, closing, 0.0)
+def approach(state: State) -> tuple[Floats, Floats]:
+    """1 / (time to collision), 1/s, and deceleration required, m/s2, of each pair, [n, N - 1] each.
+
+    0 if the gap does not close, or after an impact of the pair.
+    """
+    closing = np.maximum(state.speeds_mps[:, 1:] - state.speeds_mps[:, :-1], 0.0)
+    is_open = ~state.pair_hit & (state.gaps_m > 0.0)
+    rate = np.where(is_open, closing / np.where(is_open, state.gaps_m, 1.0), 0.0)
+    return rate, 0.5 * closing * rate
 
 
-def time_to_collision_s(state: State) -> Floats:
-    """Time in which each gap closes at present speeds, [n, N - 1] s, at most ``FREE_S``."""
-    gap, closing = _approach(state)
-    return gap / np.maximum(closing, gap / FREE_S)
+class Closest:
+    """Largest value of ``approach`` of each pair at the alert and at all decisions (a ``Watch``)."""
 
-
-def required_mps2(state: State) -> Floats:
-    """Deceleration with which each rear vehicle just avoids the vehicle ahead if that keeps its speed, [n, N - 1]."""
-    gap, closing = _approach(state)
-    return closing**2 / (2.0 * gap)
-
-
-class Extreme:
-    """Most dangerous value of each pair at the alert and at all decisions before its first impact (a ``Watch``)."""
-
-    def __init__(self, of: Callable[[State], Floats], extreme: np.ufunc, limit: float, alert: State) -> None:
-        self.of, self.extreme, self.limit, self.value = of, extreme, limit, of(alert)
+    def __init__(self, row: int, limit: float, shown: Callable[[Floats], Floats], alert: State) -> None:
+        self.row, self.limit, self.shown, self.value = row, limit, shown, approach(alert)[row]
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        self.value = self.extreme(self.value, self.of(after))
+        self.value = np.maximum(self.value, approach(after)[self.row])
 
     def result(self, last: State) -> MeasureValue:
-        line = self.extreme.reduce(self.value, axis=1)
-        pairs = {f"{i + 1}": column for i, column in enumerate(self.value.T)}
-        return {"": line, **pairs, "critical": self.extreme(line, self.limit) != self.limit}
+        line = self.value.max(axis=1)
+        pairs = {f"{i + 1}": self.shown(column) for i, column in enumerate(self.value.T)}
+        return {"": self.shown(line), **pairs, "critical": line > self.limit}
 
 
-def ttc_s(game: Game, alert: State) -> Extreme:
+def ttc_s(game: Game, alert: State) -> Closest:
     """Least time to collision, gap / closing speed, at the alert and at all decisions before a pair's first impact; 60
     s if no gap closes. Without a number: of the line; with the number of a vehicle: of this vehicle and the one behind
     it; critical: whether that of the line is below 1.5 s.
     """
-    return Extreme(time_to_collision_s, np.minimum, CRITICAL_S, alert)
+    return Closest(0, 1.0 / CRITICAL_S, lambda rate: 1.0 / np.maximum(rate, 1.0 / FREE_S), alert)
 
 
-def drac_mps2(game: Game, alert: State) -> Extreme:
+def drac_mps2(game: Game, alert: State) -> Closest:
     """Largest deceleration required to avoid a collision (DRAC), closing speed^2 / (2 gap), at the alert and at all
     decisions before a pair's first impact; large where a collision follows. Without a number: of the line; with the
     number of a vehicle: of the one behind it; critical: whether that of the line is above 3.4 m/s2.
     """
-    return Extreme(required_mps2, np.maximum, CRITICAL_MPS2, alert)
+    return Closest(1, CRITICAL_MPS2, np.asarray, alert)
 
 
 def whose_front(game: Game, alert: State, last: State) -> MeasureValue:

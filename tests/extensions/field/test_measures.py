@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.field.measures import drac_mps2, required_mps2, time_to_collision_s, ttc_s
+from ethbrake_marl.extensions.field.measures import approach, drac_mps2, ttc_s
 from ethbrake_marl.motion.layout import HIT
 from tests.episode.lines import state_of
 
@@ -16,10 +16,13 @@ ANY_GAME: Any = None  # these measures ask nothing of the game
 def test_pairs__by_hand() -> None:
     # 20 m close with 5 m/s in 4 s, which 25 / 40 m/s2 just avoids; equal speeds and an opening gap need nothing
     state = state_of([[20.0, 5.0, 8.0]], [[10.0, 15.0, 15.0, 10.0]])
-    assert time_to_collision_s(state) == pytest.approx(np.array([[4.0, 60.0, 60.0]]))
-    assert required_mps2(state) == pytest.approx(np.array([[0.625, 0.0, 0.0]]))
-    slow = state_of([[20.0]], [[10.0, 10.1]])  # 200 s
-    assert time_to_collision_s(slow) == pytest.approx(60.0) and required_mps2(slow) == pytest.approx(0.01 / 40)
+    rates, required = approach(state)
+    assert rates == pytest.approx(np.array([[1 / 4, 0.0, 0.0]])) and required == pytest.approx(
+        np.array([[0.625, 0.0, 0.0]])
+    )
+    slow = state_of([[20.0]], [[10.0, 10.1]])
+    assert ttc_s(ANY_GAME, slow).result(slow)[""] == pytest.approx(60.0)  # 200 s
+    assert drac_mps2(ANY_GAME, slow).result(slow)[""] == pytest.approx(0.01 / 40)
 
 
 def test_extremes__of_all_decisions_before_the_first_impact_of_a_pair() -> None:
