@@ -85,7 +85,7 @@ class Driver:
             time_s: time since the alert, [n] or one number.
             gaps_m: gaps between neighbours, bumper to bumper, front to rear, [n, N - 1]; below 0 counts as 0.
             speeds_mps: [n, N].
-            accelerations_mps2: what brakes and engines alone would cause now, [n, N]. Brakes keep it at rest.
+            accelerations_mps2: what brakes and engines alone have caused until now, [n, N]. Brakes keep it at rest.
             hit: whether the pair has had an impact, [n, N - 1].
             commands_mps2: last command of each vehicle, [n, N]. Only agents need it that simulate the others, or hear
                 of their intent. None: the others hold the commands that the scenario's scripts chose at the alert.
