@@ -31,7 +31,7 @@ def evaluated(jobs: int | None) -> str:
 
 def trained(config: dict[str, Any]) -> dict[str, Any]:
     """Harm and weights of a short training, as a function that Ray Tune calls."""
-    recipe = eb.load_recipe("ppo").replace(seed=config["seed"], learning_rate=config["learning_rate"])
+    recipe = eb.load_recipe("ppo").replace(**config)
     with tempfile.TemporaryDirectory() as folder:
         eb.train(recipe, "paper-random", Path(folder) / "run", steps=STEPS)
         policy = eb.load_policy(Path(folder) / "run")
@@ -46,7 +46,7 @@ def tell(where: str) -> None:
         from ray import tune
 
         ray.init(num_cpus=CORES, include_dashboard=False, logging_level="error", log_to_driver=False)
-        grid = {"seed": tune.grid_search([0, 1]), "learning_rate": tune.grid_search([3e-4, 1e-3])}
+        grid = {"seed": tune.grid_search([0, 1]), "n_epochs": tune.grid_search([2, 4])}
         tuned = tune.Tuner(trained, param_space=grid).fit()
         there = [each.metrics["digest"] for each in tuned]
         here = [trained(each.config)["digest"] for each in tuned]

@@ -29,7 +29,13 @@ REQUIRES = {
     "sumo": ("eclipse-sumo==1.28.0", "libsumo==1.28.0", "pandas>=2.2.3"),
     "highway": ("highway-env==1.12.1",),
     "asam": ("asam-qc-openscenarioxml==1.0.0", "asam-qc-opendrive==1.0.0"),
-    "clusters": ("ray[tune]==2.60.0", "distributed==2026.8.0", "stable-baselines3==2.9.2", "joblib>=1.5"),
+    "clusters": (
+        "ray[tune]==2.60.0",
+        "distributed==2026.8.0",
+        "stable-baselines3==2.9.2",
+        "joblib>=1.5",
+        "tensorboard>=2.18",
+    ),
 }
 EXPORTED = ("paper-random", "paper-random-obstacle", "cooperation-2-five", "realistic-truck", "standards-ccrs-followed")
 CHECKERS = {"xosc": ("qc_openscenario", "xoscBundle", 17), "xodr": ("qc_opendrive", "xodrBundle", 22)}
