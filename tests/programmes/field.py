@@ -6,6 +6,7 @@ Each has its own environment in ``.venvs/``; one that cannot be installed is ski
 - HighwayEnv (``highway.py``): the same worlds collide.
 - ASAM: the checkers of OpenSCENARIO and OpenDRIVE read what ``ethbrake watch --output emergency.xosc`` writes.
 - floating-car data: the gaps of a scenario that was made from SUMO's traffic are those that SUMO itself writes.
+- CommonRoad (``recordings.py``): the page's program reads a recording, and the gaps are those by hand.
 - clusters (``clusters.py``): the bits are those of one process.
 """
 
@@ -29,6 +30,7 @@ REQUIRES = {
     "sumo": ("eclipse-sumo==1.28.0", "libsumo==1.28.0", "pandas>=2.2.3"),
     "highway": ("highway-env==1.12.1",),
     "asam": ("asam-qc-openscenarioxml==1.0.0", "asam-qc-opendrive==1.0.0"),
+    "recordings": ("commonroad-io==2026.1",),
     "clusters": (
         "ray[tune]==2.60.0",
         "distributed==2026.8.0",
@@ -47,6 +49,7 @@ def cases(given: Given) -> Cases:
     for agent in AGENTS:
         yield f"SUMO: {agent}", partial(compared, "sumo", agent, given, agrees_with_sumo)
     yield "SUMO: floating-car data", partial(installed, "sumo", reads_traffic)
+    yield "CommonRoad", partial(installed, "recordings", reads_commonroad)
     for agent in AGENTS:
         yield f"HighwayEnv: {agent}", partial(compared, "highway", agent, given, agrees_with_highway)
     for scenario in EXPORTED:
@@ -139,3 +142,17 @@ def reads_traffic(python: Path) -> Told:
         pairs = rows["recording"].str.partition(": ")[2]
         equal = sum(np.abs(own[pair] - gap).min() < 1e-3 for pair, gap in zip(pairs, rows["gap_1_m"], strict=True))
     return Told(bool(equal == len(rows) > 10_000), f"{equal:,} of {len(rows):,} gaps are SUMO's own")
+
+
+def reads_commonroad(python: Path) -> Told:
+    """Let the page's program write a table, make a scenario of it, and compare its first row."""
+    with tempfile.TemporaryDirectory() as folder:
+        call = f"import os; from tests.programmes import recordings; os.chdir({folder!r}); recordings.main()"
+        status, told = watched([str(python), "-W", "ignore", "-c", call], LIMIT_S)
+        if status != 0:
+            return Told(False, told.strip()[-1500:])
+        columns = "time=t,vehicle=id,lane=lane,front=front,length=length,speed=v,units=m"
+        words = ["scenario", "from-data", "cars.csv", "--format", "table", "--columns", columns, "--output", "new.yaml"]
+        subprocess.run([sys.executable, "-m", "ethbrake_marl", *words], check=True, capture_output=True, cwd=folder)
+        row = pd.read_csv(Path(folder) / "new.csv").drop(columns="recording").iloc[0].tolist()
+    return Told(row == [15.5, 25.5, 20.0, 19.0, 22.0], str(row))
