@@ -26,7 +26,8 @@ def main() -> None:
     """Write ``recording.xml``, with three cars of constant speed in one lane, and run the block of the page."""
     scenario = Scenario(dt=STEP_S, scenario_id=ScenarioID.from_benchmark_id("ZAM_Test-1_1_T-1", "2020a"))
     middle = np.column_stack([np.linspace(0.0, 1000.0, 101), np.zeros(101)])
-    left, right = middle + [0.0, 1.75], middle - [0.0, 1.75]
+    side = np.array([0.0, 1.75])
+    left, right = middle + side, middle - side
     scenario.add_objects(Lanelet(left_vertices=left, center_vertices=middle, right_vertices=right, lanelet_id=1))
     for number, (place, speed) in enumerate(CARS):
         shape, turn = RectObstacleShape(width=1.8, length=LENGTH_M), {"orientation": 0.0, "velocity": speed}
