@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.faces.sb3 import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env
     from ethbrake_marl.faces.gymnasium import EthBrakeEnv as EthBrakeEnv
     from ethbrake_marl.faces.vector import EthBrakeVectorEnv as EthBrakeVectorEnv
+    from ethbrake_marl.faces.driver import Driver as Driver
     from ethbrake_marl.faces.shield import shield as shield
     from ethbrake_marl.shields.shield import ShieldReason as ShieldReason
 

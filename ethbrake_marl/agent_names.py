@@ -38,7 +38,7 @@ IN_FILE = re.compile(r"(?P<file>.+?\.py):(?P<name>[A-Za-z_]\w*)(:(?P<argument>[^
 MODEL_FILE = re.compile(r"[^:@]+\.(zip|pt|pth|onnx|safetensors)")
 PLAIN = re.compile(r"(?P<name>[^:@+]*)(:(?P<argument>[^@]*))?(@(?P<policy>.*))?")
 
-Driver = Agent | Team
+AgentOrTeam = Agent | Team
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class AgentEntry:
 
 def register_agent(
     name: str,
-    make: Callable[[str | None, AgentSettings], Driver] | Sequence[str],
+    make: Callable[[str | None, AgentSettings], AgentOrTeam] | Sequence[str],
     *,
     about: str = "an agent of your own",
     knows: str = UNSTATED,
@@ -133,7 +133,7 @@ AGENTS: Registry[AgentEntry] = Registry("agent", "agents", register_agent)
 WRAPPERS: Registry[AgentEntry] = Registry("shield or search", "shields", register_shield)
 
 
-def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: AnyCount = HONEST) -> Driver:
+def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: AnyCount = HONEST) -> AgentOrTeam:
     """Agent or team for a name such as ``"constant:3.5"`` or ``"ppo+step"`` (syntax: top of this file).
 
     Teams, wrappers and agents that look ahead need ``scenario``. ``harm_count``: harm that optimising agents minimise
@@ -164,7 +164,7 @@ def wrap_team(team: Team, wrapper: str, settings: AgentSettings) -> Team:
     return result._replace(name=settings.spec)
 
 
-def team_of(driver: Driver, scenario: Scenario) -> Team:
+def team_of(driver: AgentOrTeam, scenario: Scenario) -> Team:
     """A single agent drives every learner, with a separate memory for each."""
     if isinstance(driver, Team):
         return driver
@@ -242,7 +242,7 @@ def check_path(path: str | os.PathLike[str]) -> None:
         )
 
 
-def _make(core: str, settings: AgentSettings) -> Driver:
+def _make(core: str, settings: AgentSettings) -> AgentOrTeam:
     if MODEL_FILE.fullmatch(core):
         raise InvalidInput(
             f"agent {core!r}: is a file; load it: {{'mine': eb.policy_agent(MODEL)}}, where MODEL is PPO.load({core!r})"
@@ -264,7 +264,7 @@ def _make(core: str, settings: AgentSettings) -> Driver:
         make = entry.make
         if not callable(make):
             raise InvalidInput(f"agent {core!r}: is the name of a group of agents; write the name of one agent")
-    driver: Driver = _call_maker(core, make, argument or None, settings)
+    driver: AgentOrTeam = _call_maker(core, make, argument or None, settings)
     if not isinstance(driver, Team):
         check_agent(driver, f"agent {core!r} = {driver!r:.60}")
     return driver

@@ -114,6 +114,8 @@ def play_by_hand() -> float:
     team = eb.Team.of({"vehicle_2": Cautious()}, "cautious")
     last = eb.play_to_end(game, worlds, team)
     states = [state for _, state in eb.play(game, worlds, team)]
+    driver = eb.Driver("plan", worlds, scenario=scenario)
+    driver.decide(driver.first_s, after.gaps_m, after.speeds_mps, after.forces_mps2, after.pair_hit)
     return float(harm.sum() + held.sum() + after.n + last.harm("total").sum() + len(states))
 
 

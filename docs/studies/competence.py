@@ -84,9 +84,10 @@ def lines() -> dict[str, eb.Scenario]:
 
 
 def shipped() -> dict[str, eb.Scenario]:
-    """Shipped scenarios with exact impacts and a learner."""
+    """Shipped scenarios with exact impacts and a learner to whom nobody reacts."""
     loaded = [eb.load_scenario(entry.name) for entry in eb.list_scenarios()]
-    return {scenario.name: scenario for scenario in loaded if scenario.learners and scenario.physics is None}
+    exact = [scenario for scenario in loaded if scenario.learners and scenario.physics is None]
+    return {scenario.name: scenario for scenario in exact if not eb.open_game(scenario)[1].scripts}
 
 
 def costs(scenario: eb.Scenario, agents: Any, seed: int) -> dict[str, float]:

@@ -46,6 +46,9 @@ TABLES: dict[str, tuple[str, ...]] = {
 
 PICTURES: dict[str, tuple[str, ...]] = {
     "emergency.gif": ("ethbrake watch --agents full_brake,plan --output emergency.gif",),
+    "followed.gif": (
+        "ethbrake watch --scenario standards-ccrs-followed --agents aeb,idm --world 26 --output followed.gif",
+    ),
     **{
         f"gallery/{film.name}": (f"python docs/studies/gallery.py . --only {film.stem}",)
         for film in sorted((DOCS / "figures" / "gallery").glob("*.gif"))

@@ -10,5 +10,6 @@ CONTENTS = {
         "r157_fsm": "controllers:R157_FSM",
         "aeb": "controllers:AEB",
         "field": "controllers:FIELD",
-    }
+    },
+    "measures": {"ttc_s": "measures:TTC", "drac_mps2": "measures:DRAC", "whose_front": "measures:WHOSE_FRONT"},
 }

@@ -1,1 +1,1 @@
-"""Expected injuries of the impacts, as measures and as an objective."""
+"""Changes of speed by impacts, and the injuries that are expected from them, as measures and as an objective."""

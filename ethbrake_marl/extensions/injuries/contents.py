@@ -6,6 +6,7 @@ CONTENTS = {
         "injury_lr4s": "measures:LR4S",
         "injury_reference": "measures:REFERENCE",
         "injury_gidas": "measures:GIDAS",
+        "delta_v_mps": "measures:DELTA_V",
     },
     "objectives": {"injury": "curves:INJURY_OBJECTIVE"},
 }

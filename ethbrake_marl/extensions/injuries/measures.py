@@ -1,4 +1,4 @@
-"""Measures ``injury_CURVE``: expected injuries if the same impacts happened in 1,000 lines of vehicles.
+"""Measures ``delta_v_mps`` and ``injury_CURVE``: changes of speed, and expected injuries in 1,000 lines of vehicles.
 
 Injuries are added over the vehicles, each with its largest change of speed; ``injury_CURVE_2`` counts Vehicle 2 alone.
 A vehicle without an impact has no injury, even if it is pushed.
@@ -18,12 +18,32 @@ from ethbrake_marl.extensions.injuries.curves import CURVES, expected_injuries, 
 from ethbrake_marl.registry import Part
 
 
-class Injuries:
-    def __init__(self, curve: str, game: Game, alert: State) -> None:
-        self.curve, self.changes = curve, np.zeros((alert.n, 2, alert.vehicles))
+class Changes:
+    """Largest change of each vehicle's speed by one impact at its front, and at its rear (a ``Watch``)."""
+
+    def __init__(self, game: Game, alert: State) -> None:
+        self.changes = np.zeros((alert.n, 2, alert.vehicles))
 
     def see(self, before: State, step: Step | None, after: State) -> None:
         self.changes = np.maximum(self.changes, speed_changes(before, after))
+
+    def result(self, last: State) -> MeasureValue:
+        """Largest change of speed in the line, and of each vehicle, [n] m/s each."""
+        largest = self.changes.max(axis=1)
+        return {"": largest.max(axis=1), **{f"{i + 1}": column for i, column in enumerate(largest.T)}}
+
+
+def delta_v_mps(game: Game, alert: State) -> Changes:
+    """Largest change of speed (delta-v) by one impact. Without a number: in the line; with a number: of this vehicle.
+    A push is no impact.
+    """
+    return Changes(game, alert)
+
+
+class Injuries(Changes):
+    def __init__(self, curve: str, game: Game, alert: State) -> None:
+        super().__init__(game, alert)
+        self.curve = curve
 
     def result(self, last: State) -> MeasureValue:
         """Expected injuries in 1,000 lines: of the whole line, and of each vehicle, [n] each."""
@@ -41,4 +61,5 @@ def _part(curve: str) -> Part:
 
 
 INJURY = {f"injury_{curve}": _part(curve) for curve in CURVES}
+DELTA_V = Part(watch=delta_v_mps, unit="m/s")
 LR4S, REFERENCE, GIDAS = INJURY["injury_lr4s"], INJURY["injury_reference"], INJURY["injury_gidas"]

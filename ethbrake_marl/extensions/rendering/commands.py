@@ -1,4 +1,4 @@
-"""The command ``watch``: write films of episodes."""
+"""The command ``watch``: write films of episodes, and OpenSCENARIO files."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def watch_command(
     output: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.gif|FILE.mp4|FILE.png|-",
-            help="File for the film; .png: three moments of it; -: print it as text.",
+            metavar="FILE.gif|FILE.mp4|FILE.png|FILE.xosc|-",
+            help="File for the film; .png: three moments of it; .xosc: OpenSCENARIO; -: print it as text.",
             show_default=f"a window, or {DEFAULT_FILE} if none can be opened",
         ),
     ] = None,
@@ -42,11 +42,19 @@ def watch_command(
 
     The film shows the road to scale, the commands, the impacts and the harm. A PNG file shows three moments: the alert,
     the hardest impact under any agent, and the end; the text shows the alert, each pair's first impact in a time step,
-    and the end.
+    and the end. An OpenSCENARIO file (1.3) holds the trajectories under one agent; its road (OpenDRIVE) is beside it.
     """
     from ethbrake_marl.agent_names import open_game, require_learner, teams_of
     from ethbrake_marl.cli.settings import read_settings
-    from ethbrake_marl.extensions.rendering.film import WRITERS, check_film, films_in_words, films_of, show_in_window
+    from ethbrake_marl.evaluation.record import record_episodes
+    from ethbrake_marl.extensions.rendering.film import (
+        OPENSCENARIO,
+        WRITERS,
+        check_film,
+        films_in_words,
+        films_of,
+        show_in_window,
+    )
 
     with Out(force=force) as out:
         in_words = output == Path("-")
@@ -57,6 +65,17 @@ def watch_command(
         loaded, game = open_game(chosen.change_scenario(scenario))
         require_learner(loaded)
         teams = teams_of(agents, loaded, **chosen.command)
+        if output is not None and output.suffix.lower() == OPENSCENARIO:
+            if len(teams) > 1:
+                raise InvalidInput(f"--output {output}: holds the motion under one agent; --agents names {len(teams)}")
+            from ethbrake_marl.extensions.rendering.openscenario import to_openscenario
+
+            road = output.with_suffix(".xodr")
+            out.check(road)
+            record = record_episodes(loaded.sample(1, seed, first=world), next(iter(teams.values())), game)[0]
+            for path, content in zip((output, road), to_openscenario(record, road.name), strict=True):
+                out.write(path, content, what="written")
+            return
         titled = {f"{name}: world {world} of {loaded.name}": team for name, team in teams.items()}
         films = films_of(loaded.sample(1, seed, first=world), titled, game)
         if in_words:

@@ -22,6 +22,8 @@ from ethbrake_marl.motion.layout import TOTAL
 LAST_S = 2  # time for which the last scene stays (s)
 FPS = 25  # scenes per second; a divisor of 100, because a GIF stores times in hundredths of a second
 GIF_COLOURS = 64
+OPENSCENARIO = ".xosc"
+NEEDS = {".mp4": "imageio_ffmpeg", OPENSCENARIO: "jinja2"}  # file ending -> package
 ROAD = 160  # height (pixels) of title, gaps and road, the upper part of a picture
 
 
@@ -42,13 +44,12 @@ def films_of(world: State, teams: Mapping[str, Team], game: Game) -> Films:
 
 
 def check_film(ending: str) -> None:
-    """Raise ``InvalidInput`` for an ending other than .gif, .mp4, .png; ``MissingExtra`` for .mp4 without
-    imageio-ffmpeg.
-    """
-    if ending not in WRITERS:
-        raise InvalidInput(f"film with the file ending {ending!r}: the ending must be one of {', '.join(WRITERS)}")
-    if ending == ".mp4":
-        need("imageio_ffmpeg")
+    """Raise ``InvalidInput`` for an unknown ending; ``MissingExtra`` for one whose package is not installed."""
+    endings = (*WRITERS, OPENSCENARIO)
+    if ending not in endings:
+        raise InvalidInput(f"film with the file ending {ending!r}: the ending must be one of {', '.join(endings)}")
+    if ending in NEEDS:
+        need(NEEDS[ending])
 
 
 Films = Mapping[str, Sequence[Scene]]  # title -> scenes, of one world

@@ -66,6 +66,14 @@ def test_changes_of_speed__between_two_states_by_hand() -> None:
     assert changes[0] == pytest.approx(np.array([[0.0, 9.0], [3.0, 0.0]])) and not changes[1].any()
 
 
+def test_delta_v__is_the_largest_change_of_each_vehicle_by_one_impact() -> None:
+    result = eb.evaluate("paper-random", "full_brake", measures="delta_v_mps,injury_gidas", episodes=60)["full_brake"]
+    each = np.column_stack([result[f"delta_v_mps_{vehicle}"] for vehicle in (1, 2, 3)])
+    assert (result["delta_v_mps"] == each.max(axis=1)).all() and ((each.max(axis=1) > 0.0) == result["collided"]).all()
+    injuries = 1_000.0 / (1.0 + np.exp(5.82 - 0.292 * each))  # the same at front and rear
+    assert result["injury_gidas"] == pytest.approx(np.where(each > 0.0, injuries, 0.0).sum(axis=1))
+
+
 def test_injuries__of_the_honest_cost_are_those_of_impacts() -> None:
     """A kilometre apart and driving at full force, a vehicle pays for driving and motion, and nobody is hurt."""
     state = state_of([1000.0], [20.0, 20.0])
