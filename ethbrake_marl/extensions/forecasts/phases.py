@@ -4,7 +4,7 @@ A candidate is a command for each phase and the duration of all phases but the l
 several possible lines (``Forecast``), from the present to ``contacts.FORECAST_S``; a change of phase falls on a
 decision, because within a step it would not be executed. The candidates are constant brakings, what is left of the
 last plan, and numbers from a fixed pattern: the first part anywhere, then around the best so far. The pattern depends
-on vehicle and decision alone, so a world has the same plan in every batch.
+on the decision and on the vehicle's place in the row that it can predict, so a world has the same plan in every batch.
 """
 
 from __future__ import annotations
@@ -226,7 +226,10 @@ def write_number(c, most, actions, seed, tops, worth, x):
     done = (c - anywhere) / float(most - anywhere)
     place = c % PLACES if done < AROUND_ALL else worth.argmin()
     turn = done / AROUND_ALL if done < AROUND_ALL else (done - AROUND_ALL) / (1.0 - AROUND_ALL)
-    write_around(tops[place], WIDTH * SHRINK ** int(ROUNDS * turn), x, actions, seed, c)
+    shrink = 1.0
+    for _ in range(int(ROUNDS * turn)):
+        shrink *= SHRINK
+    write_around(tops[place], WIDTH * shrink, x, actions, seed, c)
     return place
 
 
@@ -255,6 +258,7 @@ def plan_worlds(car, clock, moving, plans, begun_s, forecast, settings, count, w
             continue
         time, onset = clock[k, TIME], forecast.car[k, 0, LATENCY, i]
         first, last = forecast.known[k, 0], forecast.known[k, 1]
+        seed = 1000 * (i - int(max(first, 1.0)) + 1) + int(clock[k, STEPS])
         reacts = i < last and forecast.line[k, 0, FORCE, i + 1] == 0.0
         world = i, phases, team, step_s, reaction_s if reacts else 0.0, begun_s[k] - time
         planned = write_rest(plans[k], time, onset, phases, team, car[k], rest)
@@ -266,7 +270,7 @@ def plan_worlds(car, clock, moving, plans, begun_s, forecast, settings, count, w
                 break
             place = 0
             if c > CONSTANTS:
-                place = write_number(c, most, actions, 1000 * i + int(clock[k, STEPS]), tops, worth, x)
+                place = write_number(c, most, actions, seed, tops, worth, x)
             else:
                 copy_to(x, rest)
                 for p in range(phases if c < CONSTANTS else 0):
