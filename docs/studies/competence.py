@@ -191,18 +191,19 @@ def table() -> None:
     best, rows = json.loads(BEST.read_text()), {}
     for name, scenario in every_line().items():
         row = row_of(scenario, best[name])
-        if not any(all(row[agent] == other[agent] for agent in (*RIVALS, AGENT)) for other in rows.values()):
+        if not any(all(shown(row[each]) == shown(other[each]) for each in (*RIVALS, AGENT)) for other in rows.values()):
             rows[name] = row
         print(name, row, flush=True)
     with TABLE.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["line", *next(iter(rows.values()))])
-        writer.writerows(
-            [name, *(f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row.values())]
-            for name, row in rows.items()
-        )
+        writer.writerows([name, *(shown(cell) for cell in row.values())] for name, row in rows.items())
     for cells in page_rows(read_table()):
         print(f"| {' | '.join(cells)} |")
+
+
+def shown(cell: float | str) -> str:
+    return f"{cell:.4g}" if isinstance(cell, float) else cell
 
 
 def read_table() -> list[dict[str, str]]:
