@@ -13,6 +13,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.forecasts.contacts import FORECAST_S
 from ethbrake_marl.motion import layout as at
 from ethbrake_marl.motion.interval import EVENT_BY_EVENT
+from ethbrake_marl.policies.bundle import load_shipped, shipped_policies
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.episode.lines import later, state_of
 from tests.motion.lines import driven
@@ -124,3 +125,9 @@ def test_who_is_not_known__is_not_forecast_whatever_it_does() -> None:
     line[~known[:, 3], at.SPEED, 3] = 39.0
     bits = [CONTACT.observe(s, np.array([2]), 0.1)[~known[:, 3]].tobytes() for s in (state, state._replace(line=line))]
     assert bits[0] == bits[1]
+
+
+def test_policies_that_observe_forecasts__have_a_range() -> None:
+    assert shipped_policies().keys() == {"ppo", "sac", "vine-paper", "vine-preference"}
+    for name in ("vine-paper", "vine-preference"):
+        assert load_shipped(name).manifest.training_range is not None
