@@ -24,9 +24,11 @@ GAME = ("motion.", "episode.step:", "episode.game:Game", "worlds.sampling:")
 
 @cache
 def modules() -> dict[str, ModuleType]:
-    """All modules of the package that can be imported here, by name."""
+    """All modules of the package that can be imported here, by name, without the program (``__main__``)."""
     found = {}
     for info in pkgutil.walk_packages(ethbrake_marl.__path__, PREFIX):
+        if info.name.endswith("__main__"):  # who runs it later would be warned that it has been imported
+            continue
         try:
             found[info.name] = importlib.import_module(info.name)
         except (MissingExtra, ModuleNotFoundError):
