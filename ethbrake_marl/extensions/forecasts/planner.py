@@ -15,6 +15,7 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import HONEST, HarmCount
 from ethbrake_marl.episode.departures import SHOWN
+from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MESSAGES, Observer
 from ethbrake_marl.episode.plans import COMMANDS, PHASES, PLAN_NUMBERS, PLANS_KEY, PlanMemory
 from ethbrake_marl.episode.state import State, require
@@ -48,6 +49,14 @@ class Planner(Observer):
     candidates: int = CANDIDATES
     name: str = "plan"
     knows: str = MESSAGES
+
+    def check(self, game: Game, body: int) -> None:
+        """Raise ``InvalidInput`` in a game with another time step, in which phases would not end at decisions."""
+        if game.settings.time_step_s != self.time_step_s:
+            raise InvalidInput(
+                f"agent {self.name!r}: was made for decisions every {self.time_step_s:g} s, but scenario {game.name!r}"
+                f" has one every {game.settings.time_step_s:g} s; make the agent with this scenario"
+            )
 
     def begin(self, alert: State, body: int) -> PlanMemory:
         return PlanMemory(np.full((alert.n, PLAN_NUMBERS), np.nan), np.full(alert.n, np.inf))
@@ -127,7 +136,7 @@ def make_plans(
 def make_planner(argument: str | None, settings: Any) -> Planner:
     match = ARGUMENT.fullmatch(argument or str(PHASES))
     reaction_s = 0.0 if match is None else float(match["reaction"] or 0.0)
-    if match is None or reaction_s > LONGEST_REACTION_S:
+    if match is None or not (match["phases"] or 0.0 < reaction_s <= LONGEST_REACTION_S):
         raise InvalidInput(
             f"agent {settings.spec!r}: must be plan, plan:1 or plan:2 for fewer phases, or plan:reaction=SECONDS with"
             f" the time, above 0 and at most {LONGEST_REACTION_S:g} s, after which the vehicle behind reacts"

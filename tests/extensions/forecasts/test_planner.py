@@ -150,11 +150,17 @@ def test_reaction__lets_the_vehicle_behind_coast_until_it_sees_braking() -> None
 
 
 @pytest.mark.parametrize(
-    "name", ["plan:0", "plan:4", "plan:x", "plan:reaction=", "plan:reaction=11", "plan:reaction=-1"]
+    "name", ["plan:0", "plan:4", "plan:x", "plan:reaction=", "plan:reaction=0", "plan:reaction=11", "plan:reaction=-1"]
 )
 def test_bad_argument__is_refused(name: str) -> None:
     with refused(f"agent '{name}': must be plan, plan:1 or plan:2"):
         eb.make_agent(name, scenario=PAPER)
+
+
+def test_plan__is_refused_where_decisions_come_at_other_times() -> None:
+    agent = eb.make_agent("plan", scenario=PAPER)
+    with refused("agent 'plan': was made for decisions every 0.1 s, but scenario 'paper-random' has one every 0.2 s"):
+        eb.evaluate(PAPER.replace(time_step_s=0.2), {"plan": agent}, episodes=2)
 
 
 def test_plan__needs_a_scenario() -> None:
