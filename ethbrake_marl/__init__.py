@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     # Agents, teams and policies
     from ethbrake_marl.agent_names import AgentSettings as AgentSettings, make_agent as make_agent
     from ethbrake_marl.agents.team import Agent as Agent, Team as Team, play_to_end as play_to_end, play as play
+    from ethbrake_marl.agents.action_scale import ActionScale as ActionScale
     from ethbrake_marl.agents.policy_agent import LearnedAgent as LearnedAgent, policy_agent as policy_agent
     from ethbrake_marl.policies.bundle import load_policy as load_policy, load_shipped as load_shipped
     from ethbrake_marl.policies.policy import Policy as Policy

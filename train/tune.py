@@ -1,29 +1,43 @@
-"""Search for settings of a recipe that lead to little harm, with Optuna. Read it from top to bottom.
+"""Search for settings of a recipe or method that lead to little harm, with Optuna. Read it from top to bottom.
 
     python train/tune.py --scenario paper-random --recipe ppo --search n_epochs=1..4 gamma=0.99/1.0 --output runs/tuning
+    python train/tune.py --scenario benchmark-pair --recipe train/benchmark/sb3.py:ppo --search n_epochs=5/10 --output t
 
 A trial is one training run, and its harm is the harm of its saved policy in the worlds of the recipe's evaluation, as
-the reward counts it: the honest cost, or first-impact harm with ``--set harm_count=first``.
+the reward counts it: the honest cost, or first-impact harm with ``--set harm_count=first``. A method of the benchmark,
+``FILE.py:FUNCTION``, gets the settings as keywords and 200,000 decisions; its harm is the honest cost in list 8.
 ``--jobs`` trials are proposed together, then trained at the same time. After an interruption, start the same command
 again: it keeps the trials in ``optuna.log``, and has the same result. A larger number of ``--trials`` adds trials.
 """
 
 import argparse
+import inspect
+import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import optuna
+import yaml
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
 from ethbrake_marl.cli.settings import read_settings
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.evaluation.benchmark import evaluate_task
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.sheet import csv_text
-from ethbrake_marl.files.store import write_file
+from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.training.job import Job, folder_of_many
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.training import Training
+from ethbrake_marl.worlds.scenario import Scenario
+
+HARM = "harm.json"  # file of a method's trial
+DECISIONS, TRIAL_SEED, LIST_SEED = 200_000, 1000, 8
 
 
 def read_search(text: str) -> tuple[str, BaseDistribution]:
@@ -40,11 +54,55 @@ def read_search(text: str) -> tuple[str, BaseDistribution]:
         raise InvalidInput(f"--search {text}: must be KEY=A/B, KEY=LOW..HIGH or KEY=LOW..HIGH:log ({error})") from None
 
 
-def tune(args: argparse.Namespace) -> None:
-    """Train until ``--trials`` trials have ended, and write ``trials.csv``."""
-    space, loaded = dict(map(read_search, args.search)), load_recipe(args.recipe)
-    if min(args.jobs, args.trials) < 1 or len(space) < len(args.search):
-        raise InvalidInput("--jobs and --trials must be 1 or more, and --search must name each key only once")
+class MethodJob(NamedTuple):
+    """Trial of a method of the benchmark, with the functions of ``Job``."""
+
+    task: Scenario
+    method: str
+    values: dict[str, Any]
+    folder: Path
+
+    @property
+    def identity(self) -> Any:
+        return [self.task.content(), self.method]
+
+    def attempt(self) -> str:
+        path, function = self.method.rsplit(":", 1)
+        file = self.folder / HARM
+        try:
+            if not self.folder.exists():
+                with new_folder(self.folder) as partial:
+                    load_from_file(path, function)(self.task, TRIAL_SEED, DECISIONS, partial, **self.values)
+            if not file.exists():
+                result = evaluate_task(self.task, {"trial": f"{path}:make_agent:{self.folder}"}, seed=LIST_SEED)
+                write_file(file, json.dumps({"harm": result["trial"]["honest_cost"].mean()}).encode())
+        except (EthBrakeError, ArithmeticError, ValueError) as error:
+            return str(error)
+        return ""
+
+    def result(self) -> dict[str, Any]:
+        return read_object(self.folder / HARM)
+
+
+def identity_of(job: Job | MethodJob) -> Any:
+    return job.identity if isinstance(job, MethodJob) else job.training.identity
+
+
+def jobs_of_method(args: argparse.Namespace) -> Callable[..., MethodJob]:
+    scenario, (path, function) = read_settings(args.set).change_scenario(args.scenario), args.recipe.rsplit(":", 1)
+    known = inspect.signature(load_from_file(path, function)).parameters
+
+    def job(values: dict[str, object], folder: str = "") -> MethodJob:
+        if unknown := values.keys() - known:
+            raise InvalidInput(f"{args.recipe}: has no setting {min(unknown)!r}; has {', '.join(known)}")
+        plain = {key: yaml.safe_load(value) if isinstance(value, str) else value for key, value in values.items()}
+        return MethodJob(scenario, args.recipe, plain, args.output.absolute() / folder)
+
+    return job
+
+
+def jobs_of_recipe(args: argparse.Namespace) -> Callable[..., Job]:
+    loaded = load_recipe(args.recipe)
     keys = [*type(loaded).model_fields]
     settings = read_settings(args.set, keys)
     scenario, recipe = settings.change_scenario(args.scenario), settings.change_recipe(loaded)
@@ -54,10 +112,20 @@ def tune(args: argparse.Namespace) -> None:
         training, path = Training.of(own.change_recipe(recipe), scenario), args.output.absolute() / folder
         return Job(training, path, (*args.set, *own.texts))
 
+    return job
+
+
+def tune(args: argparse.Namespace) -> None:
+    """Train until ``--trials`` trials have ended, and write ``trials.csv``."""
+    space = dict(map(read_search, args.search))
+    if min(args.jobs, args.trials) < 1 or len(space) < len(args.search):
+        raise InvalidInput("--jobs and --trials must be 1 or more, and --search must name each key only once")
+    job: Callable[..., Job | MethodJob] = (jobs_of_method if ".py:" in args.recipe else jobs_of_recipe)(args)
+
     for key, each in space.items():  # raises now what a trial would raise
         for value in each.choices if isinstance(each, CategoricalDistribution) else (each.low, each.high):
             job({key: value})
-    question = {"training": job({}).training.identity, "search": args.search, "jobs": args.jobs}
+    question = {"training": identity_of(job({})), "search": args.search, "jobs": args.jobs}
     with folder_of_many(args.output, "trials.csv"):
         log = args.output / "optuna.log"
         try:
@@ -86,7 +154,7 @@ def tune(args: argparse.Namespace) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", required=True, help="name or path of a scenario")
-    parser.add_argument("--recipe", required=True, help="name or path of a recipe")
+    parser.add_argument("--recipe", required=True, help="name or path of a recipe, or FILE.py:FUNCTION")
     parser.add_argument("--search", nargs="+", required=True, metavar="KEY=VALUES", help="choices and ranges to search")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings of every trial")
     parser.add_argument("--trials", type=int, default=30, help="number of trials in all (default: 30)")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.agents.action_scale import REACH, ActionForm, ActionScale, count_in
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.errors import InvalidInput
@@ -99,18 +100,20 @@ def features_of(policy: Any) -> tuple[str, ...] | None:
     return getattr(getattr(policy, "observation_space", None), "features", None)
 
 
-def count_of_actions(policy: Any, count: int | None, who: str) -> int | None:
-    """Number of discrete actions of a policy; None if it returns numbers in [-1, 1].
+def form_of_actions(policy: Any, form: ActionForm, who: str) -> ActionForm:
+    """Form of the actions of a policy. ``form``: as the user states.
 
-    ``count``: as the user states. Raises ``InvalidInput``, beginning with ``who``, for an action space that does not
-    fit.
+    Raises ``InvalidInput``, beginning with ``who``, for an action space that does not fit.
     """
     space: Any = getattr(policy, "action_space", None)
-    if count is None and getattr(space, "evenly_spaced", False):  # of an environment of this package
-        count = int(space.n)
+    if form is None and getattr(space, "scale", None):  # of an environment of this package, as below
+        form = ActionScale(*space.scale)
+    if form is None and getattr(space, "evenly_spaced", False):
+        form = int(space.n)
+    count, reach = count_in(form, f"{who}: actions"), REACH if isinstance(form, ActionScale) else 1.0
     if count is None:
-        fits = [np.asarray(getattr(space, end, None)).tolist() for end in ("low", "high")] == [[-1.0], [1.0]]
-        right = "a number in [-1, 1]; for indices of K evenly spaced actions pass actions=K"
+        fits = [np.asarray(getattr(space, end, None)).tolist() for end in ("low", "high")] == [[-reach], [reach]]
+        right = f"a number in [-{reach:g}, {reach:g}]; for indices of K evenly spaced actions pass actions=K"
     else:
         fits = (getattr(space, "n", None), getattr(space, "start", None)) == (count, 0)
         right = f"an index from 0 to {count - 1} (actions={count})"
@@ -119,7 +122,7 @@ def count_of_actions(policy: Any, count: int | None, who: str) -> int | None:
             f"{who}: the actions of the policy are in {space}; must be {right}; or write a function around the policy"
             " that converts its actions"
         )
-    return count
+    return form
 
 
 def statistics_of(model: Any) -> Any:

@@ -11,14 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.agents.action_scale import REACH, ActionForm, ActionScale, count_in
 from ethbrake_marl.agents.foreign import (
     Ask,
     ask_function,
     ask_of,
     check_gamma,
     check_wrappers,
-    count_of_actions,
     features_of,
+    form_of_actions,
 )
 from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
 from ethbrake_marl.episode.counts import COUNTS, HarmCount
@@ -27,7 +28,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import NUMBER, State, map_arrays
-from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_whole_number
+from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.manifest import PHYSICS_KEY
@@ -131,7 +132,7 @@ class PolicyAgent(RangeObserver):
     time_step_s: float  # between two decisions in training; only forecasts need it
     initial_state: Callable[[int], Any] | None
     clip: bool
-    actions: int | None
+    actions: ActionForm
     knows: str = MESSAGES
 
     def check(self, game: Game, body: int) -> None:
@@ -175,9 +176,11 @@ class PolicyAgent(RangeObserver):
 
     def _actions(self, answer: Any, state: State, body: int) -> Floats:
         """Actions in [-1, 1], [n], from the answer of the policy."""
-        action_array, n, last = to_array(answer), state.n, (self.actions or 0) - 1
-        kinds, low, high, right = "fiu", -1.0, 1.0, "a number in [-1, 1]"
-        if self.actions is not None:
+        scale = self.actions if isinstance(self.actions, ActionScale) else None
+        action_array, n, count = to_array(answer), state.n, count_in(self.actions)
+        last, reach = (count or 0) - 1, 1.0 if scale is None else REACH
+        kinds, low, high, right = "fiu", -reach, reach, f"a number in [-{reach:g}, {reach:g}]"
+        if count is not None:
             kinds, low, high, right = "iu", 0.0, float(last), f"an index from 0 to {last}"
         if action_array.shape not in ((n,), (n, 1)) or action_array.dtype.kind not in kinds:
             what = f"{answer!r:.40}, {action_array.dtype} of shape {action_array.shape}"
@@ -192,7 +195,8 @@ class PolicyAgent(RangeObserver):
             number = int(state.clock[k, NUMBER])
             reason = f"vehicle_{body} at {state.time_s[k]:.2f} s: action {values[k]:g}; must be {right}"
             raise AgentFailed(self.name, k if number < 0 else number, f"{reason}; clip=True clips to the nearest one")
-        return np.clip(values, -1.0, 1.0) if self.actions is None else (2.0 * values - last) / last
+        numbers = np.clip(values, -reach, reach) if count is None else reach * ((2.0 * values - last) / last)
+        return numbers if scale is None else scale.actions(numbers)
 
 
 def to_array(value: Any) -> NDArray[Any]:
@@ -210,7 +214,7 @@ def policy_agent(
     observation: View | Sequence[str] | None = None,
     initial_state: Callable[[int], Any] | None = None,
     clip: bool = False,
-    actions: int | None = None,
+    actions: ActionForm = None,
     ignore_wrappers: bool = False,
 ) -> PolicyAgent:
     """Agent that drives with a policy of any library.
@@ -226,8 +230,9 @@ def policy_agent(
         observation: features on which the policy was trained; None: the features named by its observation space, or
             else those of ``scenario``, or else, with a warning, ``[own, front_1, rear_1]``.
         initial_state: number of episodes n -> first memory: an array with n rows, or a tuple of such arrays.
-        clip: clip actions to [-1, 1], or indices to the valid ones; otherwise they are errors.
-        actions: number of discrete actions, evenly spaced from -1 to 1, if the policy returns indices.
+        clip: clip numbers to their range, or indices to the valid ones; otherwise they are errors.
+        actions: number of discrete actions, evenly spaced from -1 to 1, if the policy returns indices; or an
+            ``ActionScale``; None: as the model's action space says.
         ignore_wrappers: accept a model whose training environment has wrappers that may change observations or actions.
 
     Raises ``InvalidInput`` for an unknown kind of policy, if observations or actions would differ from its training,
@@ -242,8 +247,7 @@ def policy_agent(
     if name is None:
         name = str(getattr(policy, "__name__", type(policy).__name__))
     who = f"agent {name!r}"
-    if actions is not None:
-        check_whole_number(f"{who}: actions", actions, 2)
+    count_in(actions, f"{who}: actions")
     ask = ask_of(policy, who)
     if initial_state is not None and (ask is not ask_function or not callable(initial_state)):
         raise InvalidInput(
@@ -253,7 +257,7 @@ def policy_agent(
     check_gamma(policy, who)
     if not ignore_wrappers:
         check_wrappers(policy, who)
-        actions = count_of_actions(policy, actions, who)
+        actions = form_of_actions(policy, actions, who)
     trained_on, trained_in = features_of(policy), None if scenario is None else load_scenario(scenario)
     view = _view(observation, trained_on, trained_in, who)
     if trained_in is None and any(feature.partition(".")[0] in GROUPS for feature in view.names):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ethbrake_marl.agents.action_scale import ActionScale
 from ethbrake_marl.evaluation.evaluate import SEED, Result, evaluate
 from ethbrake_marl.evaluation.measure_registry import MEASURES
 from ethbrake_marl.evaluation.summary import SummaryTable
@@ -16,6 +17,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 BENCHMARK = "benchmark"  # group of scenarios, the tasks
 EPISODES = 2_000  # worlds of each task, from the evaluation list of seed ``SEED``
+START = ActionScale(offset=-0.9, scale=0.3)  # what tasks offer to methods: brake hard at first, with little noise
 BEST_KNOWN = "limits"  # measure that gives the share of the possible reduction
 PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 COLUMNS = (

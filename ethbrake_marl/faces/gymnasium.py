@@ -11,6 +11,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from ethbrake_marl.agent_names import open_game
+from ethbrake_marl.agents.action_scale import ActionForm
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import steps_to_horizon
@@ -45,7 +46,7 @@ class OneLearner(Face):
         return int(min(steps_to_horizon(first_s, settings), settings.most_steps))
 
     def _open_one(
-        self, game: tuple[Any, ...], render_mode: str | None, actions: int | None, most_steps: int | None
+        self, game: tuple[Any, ...], render_mode: str | None, actions: ActionForm, most_steps: int | None
     ) -> tuple[Any, Any]:
         self._open(open_game(*game), render_mode, most_steps)
         self.bodies, self.actions = self.game.settings.learners, actions
@@ -91,7 +92,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
         learners: Sequence[str] | None = None,
         reward: Any = "shaped",
         observation: Any = None,
-        actions: int | None = None,
+        actions: ActionForm = None,
         reward_vector: Any = None,
         report: Sequence[str] = (),
         max_cycles: int | None = None,

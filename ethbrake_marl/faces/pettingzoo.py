@@ -13,6 +13,7 @@ from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.agent_names import open_game
+from ethbrake_marl.agents.action_scale import ActionForm
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import ENDED, State
@@ -65,7 +66,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
         max_cycles: number of steps after which an episode is truncated (info ``cut``); None: only at the horizon.
-        actions: form of actions. None: numbers in [-1, 1]. K >= 2: indices of K evenly spaced numbers.
+        actions: form of actions. None: numbers in [-1, 1]. K >= 2: indices of K evenly spaced numbers. Or an
+            ``ActionScale``.
         reward_vector: components of array rewards, ``vehicles`` or a list of names (``episode.terms``); None: rewards
             are numbers.
         report: names of terms (``episode.terms``) whose value infos contain as ``reward_NAME``, with or without a
@@ -92,7 +94,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         observation: Any = None,
         agents: str = "all",
         max_cycles: int | None = None,
-        actions: int | None = None,
+        actions: ActionForm = None,
         reward_vector: Any = None,
         report: Sequence[str] = (),
     ) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from ethbrake_marl.agent_names import open_game
+from ethbrake_marl.agents.action_scale import ActionForm
 from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.game import Game
@@ -40,7 +41,7 @@ def make_sb3_vec_env(
     appended: Appended | None = None,
     step_infos: bool = False,
     render_mode: str | None = None,
-    actions: int | None = None,
+    actions: ActionForm = None,
     report: Sequence[str] = (),
     max_cycles: int | None = None,
     threads: int | None = None,
@@ -99,7 +100,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         appended: Appended | None = None,
         step_infos: bool = False,
         render_mode: str | None = None,
-        actions: int | None = None,
+        actions: ActionForm = None,
         max_cycles: int | None = None,
     ) -> None:
         self.bodies = game.settings.learners

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from ethbrake_marl.agents.action_scale import ActionForm
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State
@@ -59,7 +60,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         observation: Any = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
-        actions: int | None = None,
+        actions: ActionForm = None,
         reward_vector: Any = None,
         report: Sequence[str] = (),
         threads: int | None = None,

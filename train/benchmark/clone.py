@@ -9,6 +9,7 @@ only the observations of the learners, and one network drives all of them.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.search.pricing import problem_of
 
-CANDIDATES, EPOCHS, BATCH, RATE, HIDDEN = 500, 20, 512, 1e-3, 128
+CANDIDATES, BATCH = 500, 512
 
 
 def demonstrations(task: eb.Scenario, seed: int, decisions: int) -> tuple[Tensor, Tensor]:
@@ -44,29 +45,34 @@ def demonstrations(task: eb.Scenario, seed: int, decisions: int) -> tuple[Tensor
     return torch.cat(seen)[:decisions], torch.cat(actions)[:decisions]
 
 
-def network_of(features: int) -> nn.Sequential:
+def network_of(features: int, hidden: int) -> nn.Sequential:
     return nn.Sequential(
-        nn.Linear(features, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 1)
+        nn.Linear(features, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 1)
     )
 
 
-def clone(task: eb.Scenario, seed: int, decisions: int, folder: Path) -> None:
+def clone(
+    task: eb.Scenario, seed: int, decisions: int, folder: Path,
+    learning_rate: float = 1e-3, n_epochs: int = 20, hidden: int = 128,
+) -> dict[str, Any]:  # fmt: skip
     torch.manual_seed(seed)
     seen, actions = demonstrations(task, seed, decisions)
-    network = network_of(seen.shape[1])
-    optimiser = torch.optim.Adam(network.parameters(), RATE)
-    for _ in range(EPOCHS):
+    network = network_of(seen.shape[1], hidden)
+    optimiser = torch.optim.Adam(network.parameters(), learning_rate)
+    for _ in range(n_epochs):
         for rows in torch.split(torch.randperm(len(seen)), BATCH):
             loss = nn.functional.mse_loss(network(seen[rows]), actions[rows])
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
     save_file(network.state_dict(), folder / "network.safetensors")
+    searches = len(task.learners) + 1 if len(task.learners) > 1 else 1  # each learner alone, then all together
+    return {"start": "none", "simulated": decisions * (1 + searches * CANDIDATES)}
 
 
 def make_agent(folder: str, settings: eb.AgentSettings) -> eb.Agent:
     """Agent with the network that `clone` has saved in `folder`."""
     weights = load_file(Path(folder) / "network.safetensors")
-    network = network_of(weights["0.weight"].shape[1])
+    network = network_of(*weights["0.weight"].shape[::-1])
     network.load_state_dict(weights)
     return eb.policy_agent(network, name="clone", scenario=settings.needed_scenario(), clip=True)

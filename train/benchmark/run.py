@@ -56,6 +56,7 @@ METHODS = {
     "mappo": f"{HERE}/marl.py:mappo",
     "iql": f"{HERE}/marl.py:iql",
     "clone": f"{HERE}/clone.py:clone",
+    "cooperation": f"{HERE}/vine.py:cooperation",
 }
 WARM: set[tuple[str, str]] = set()  # tasks and methods for which this process has compiled everything
 ABOUT = "training.json"  # file in the folder of a training by a Python file: decisions, scenario, processor time
@@ -143,14 +144,15 @@ class Job(NamedTuple):
             train = load_from_file(path, function)
             with new_folder(self.folder) as partial:
                 start = time.process_time()
-                train(self.task, self.seed, self.decisions, partial)
+                told = train(self.task, self.seed, self.decisions, partial) or {}
                 spent = {"cpu_s": round(time.process_time() - start, 1)}
-                (partial / ABOUT).write_text(json.dumps(about | spent))
+                (partial / ABOUT).write_text(json.dumps({**about, **spent, "told": told}))
         done = read_object(self.folder / ABOUT)
         if {key: done.get(key) for key in about} != json.loads(json.dumps(about)):
             right = "delete it, or use another folder"
             raise InvalidInput(f"{self.folder}: has a training with other settings or another file; {right}")
-        return {"decisions": self.decisions, "cpu_s": done["cpu_s"]}
+        row = {"decisions": self.decisions, "cpu_s": done["cpu_s"], "start": "none", **done["told"]}
+        return {"simulated": row["decisions"], **row}
 
     def evaluate(self, about: dict[str, Any]) -> list[dict[str, Any]]:
         """Rows of full braking and of the method."""

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agent_names import open_game
+from ethbrake_marl.agents.action_scale import ActionForm, count_in
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, naming_extras
@@ -47,7 +48,8 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         reward: a name such as ``shaped``, or the weights of the reward's terms.
         horizon_is_end: True: an episode that reaches the horizon is terminated; False: it is truncated.
         shield: mode of the learners' shield, such as ``step``. None: no shield.
-        actions: number of discrete actions, for algorithms such as QMIX; None: actions are numbers in [-1, 1].
+        actions: number of discrete actions, for algorithms such as QMIX, or an ``ActionScale``; None: numbers in
+            [-1, 1].
 
     """
 
@@ -62,7 +64,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         reward: Any = "shaped",
         horizon_is_end: bool = True,
         shield: str | None = None,
-        actions: int | None = None,
+        actions: ActionForm = None,
     ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([n]))
         loaded, game = open_game(scenario, reward=reward)
@@ -85,7 +87,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
             {GROUP: Composite({"observation": observation_bound}, shape=rows), "state": state_bound}, shape=(n,)
         )
         space = action_space(actions)
-        action = Bounded(-1.0, 1.0, shape=(*rows, 1)) if actions is None else Categorical(space.n, shape=rows)
+        action = _bound(space, rows) if count_in(actions) is None else Categorical(space.n, shape=rows)
         self.action_spec = Composite({GROUP: Composite({"action": action}, shape=rows)}, shape=(n,))
         rewards = Composite({"reward": Unbounded(shape=(*rows, 1))}, shape=rows)
         self.reward_spec = Composite({GROUP: rewards}, shape=(n,))
@@ -157,7 +159,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
         Raises ``InvalidInput`` if ``continuous_actions`` contradicts ``actions`` in the task's ``config``.
         """
-        actions = self.config.get("actions")
+        actions = count_in(self.config.get("actions"))
         if continuous_actions != (actions is None):
             raise InvalidInput(
                 f"task {self.name}: continuous_actions = {continuous_actions} contradicts actions = {actions}; for"
@@ -167,10 +169,10 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return partial(LineEnv, n=num_envs, seed=seed or 0, **self.config)
 
     def supports_continuous_actions(self) -> bool:
-        return self.config.get("actions") is None
+        return count_in(self.config.get("actions")) is None
 
     def supports_discrete_actions(self) -> bool:
-        return self.config.get("actions") is not None
+        return not self.supports_continuous_actions()
 
     def max_steps(self, env: Any) -> int:
         return round(self.scenario.horizon_s / self.scenario.time_step_s) + 1

@@ -96,7 +96,7 @@ class VineModel(BaseAlgorithm):
         )
         self.recipe = recipe
         self.rows, self.features = environment, training.row.names
-        self.learners = len(environment.bodies)
+        self.learners, self.simulated = len(environment.bodies), 0  # decisions in branches since the last update
         self._setup_model()
 
     def _setup_model(self) -> None:
@@ -175,6 +175,7 @@ class VineModel(BaseAlgorithm):
 
         def decide(now: Moment) -> Floats:
             actions = now.ask(self.policy.act)
+            self.simulated += actions.size
             held = np.flatnonzero(now.number < steps[now.rows]) if now.number < longest else steps[:0]
             row = now.rows[held]
             before = actions[held, learner[row]]
@@ -212,6 +213,8 @@ class VineModel(BaseAlgorithm):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
         self.logger.record("train/gradient", float(results.gradient.abs().mean()) if losses else 0.0)
         self.logger.record("train/tried", len(results.seen))
+        self.logger.record("train/simulated", self.simulated)
+        self.simulated = 0
 
 
 def trusted_targets(results: TrialResults, radius: float, anchor: float) -> tuple[Tensor, Tensor]:
