@@ -1,19 +1,12 @@
-"""A policy with a memory (GRU), shared by all learners, for late and lost messages. Read it from top to bottom.
+"""Recurrent PPO: a policy with a memory (GRU), shared by all learners, for late and lost messages.
 
-    ethbrake scenario new lossy --based-on cooperation-3-pair     # then: v2x: {preset: blocked, persistence: periodic}
-    python train/recurrent.py --scenario lossy.yaml --output gru
-    ethbrake evaluate --scenario lossy.yaml --agents full_brake,train/recurrent.py:make_agent:gru
+    python train/recurrent.py --scenario benchmark-blocked --output gru
+    ethbrake evaluate --scenario benchmark-blocked --agents full_brake,train/recurrent.py:make_agent:gru
+    python train/benchmark/run.py --tasks benchmark-blocked --methods train/recurrent.py:train --output runs/recurrent
 
 Information about other vehicles grows old between two messages. A memory can use earlier observations, too. The
-training is a plain policy gradient on whole episodes, on arrays of all learners (docs/environments.md).
-``--memoryless`` trains the same policy without a memory, for comparison. In these trainings the memory did not help, so
-the ages of the messages seem to be enough. First-impact harm after ``--harm-count first``, on 2,000 worlds of seed 7
-(one thread, AMD EPYC, 2026-11-24):
-
-    agent                                              with memory     without memory
-    after ``--updates 500``                            23.32           22.66
-    after ``--updates 200``, seeds 0 and 1             27.01, 27.07    25.98, 25.33
-    full braking                                                       44.83
+training is PPO on whole episodes, on arrays of all learners (docs/environments.md). ``--memoryless`` trains the same
+policy without a memory, for comparison. Read it from top to bottom.
 """
 
 from __future__ import annotations
@@ -30,15 +23,17 @@ from torch import Tensor, nn
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import COUNTS
+from ethbrake_marl.evaluation.benchmark import START
 from ethbrake_marl.files.store import new_folder
 
 # 1. Default observation, if the scenario has none: also the age of the news, and the vehicle's place in the line.
 
 OBSERVATION = ["own", "front_1", "rear_1", "front_1.age", "rear_1.age", "place"]
-HIDDEN, NOISE, RATE = 64, 0.3, 3e-3
+HIDDEN, WORLDS, CLIP, TRACE, RATIO = 64, 64, 0.5, 0.95, 0.2
+REWARD = {"harm": 0.05, "shaping": 0.05, "shaping_discount": 1.0}
 
 
-# 2. The network: observation [rows, F] and memory [rows, H] -> mean of the action [rows] and new memory [rows, H].
+# 2. The network: observation [rows, F] and memory [rows, H] -> mean of the number [rows], value [rows], new memory.
 
 
 class Recurrent(nn.Module):
@@ -46,49 +41,77 @@ class Recurrent(nn.Module):
 
     def __init__(self, features: int, remembers: bool) -> None:
         super().__init__()
-        self.cell, self.head, self.remembers = nn.GRUCell(features, HIDDEN), nn.Linear(HIDDEN, 1), remembers
+        self.cell, self.head, self.remembers = nn.GRUCell(features, HIDDEN), nn.Linear(HIDDEN, 2), remembers
 
-    def forward(self, seen: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean of the action [rows] and the new memory [rows, H]."""
+    def forward(self, seen: Tensor, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         memory = self.cell(seen, memory if self.remembers else torch.zeros_like(memory))
-        return self.head(memory)[:, 0], memory
+        mean, value = self.head(memory).unbind(1)
+        return mean, value, memory
 
 
-# 3. Training: every update simulates the next n episodes, and then learns from all their decisions.
+# 3. Training: every update simulates the next episodes, and then learns from all their decisions.
 
 
-def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespace) -> Recurrent:
-    """Trained network. Every ten updates, print the mean of what the reward counts."""
-    torch.manual_seed(args.seed)
-    _, game = eb.open_game(scenario, observation=observation, reward={"harm_count": args.harm_count})
+def train(
+    task: eb.Scenario, seed: int, decisions: int, folder: Path,
+    learning_rate: float = 1e-3, epochs: int = 10, noise: float = 1.0, harm_count: str = "honest",
+    memoryless: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Train with at most so many decisions, and save the network in `folder`."""
+    torch.manual_seed(seed)
+    observation = list(task.observation or OBSERVATION)
+    _, game = eb.open_game(task, observation=observation, reward={**REWARD, "harm_count": harm_count})
     learners = game.settings.learners
-    n, shape = args.worlds, (args.worlds, len(learners))
-    network = Recurrent(len(eb.View(observation).names), not args.memoryless)
-    optimiser = torch.optim.Adam(network.parameters(), lr=RATE)
-    for update in range(args.updates):
-        optimiser.param_groups[0]["lr"] = RATE * (1 - update / args.updates)
-        state = game.reset(game.draw(n, args.seed, first=n * update))
-        memory, chosen, gained = torch.zeros(n * len(learners), HIDDEN), [], []
+    network = Recurrent(len(eb.View(observation).names), not memoryless)
+    optimiser = torch.optim.Adam(network.parameters(), lr=learning_rate)
+    used, spent, first = 0, 0, 0
+    while first == 0 or used + spent <= decisions:  # as many again still fit
+        optimiser.param_groups[0]["lr"] = learning_rate * (1 - used / decisions)
+        state = game.reset(game.draw(WORLDS, seed, first=first))
+        memory, steps = torch.zeros(WORLDS * len(learners), HIDDEN), []
         while not state.ended.all():
-            running = torch.from_numpy(~state.ended)[:, None]
+            running = torch.from_numpy(~state.ended).repeat_interleave(len(learners))
             seen = torch.from_numpy(game.observe_alike(state, learners)).flatten(0, 1)
-            mean, memory = network(seen, memory)
-            policy: Any = torch.distributions.Normal(mean.view(shape), NOISE)  # torch's distributions are untyped
-            actions = policy.sample()
-            state, step = game.step(state, actions.clamp(-1, 1).numpy())
-            chosen.append(policy.log_prob(actions) * running)
-            gained.append(torch.from_numpy(step.reward[:, learners - 1]))
-        to_go = torch.stack(gained).flip(0).cumsum(0).flip(0)
-        advantage = (to_go - to_go.mean(1, keepdim=True)) / (to_go.std() + 1e-8)
-        loss: Any = -(torch.stack(chosen) * advantage).sum() / sum(shape)
+            with torch.no_grad():
+                mean, value, memory = network(seen, memory)
+            policy: Any = torch.distributions.Normal(mean, noise)  # torch's distributions are untyped
+            number = policy.sample()
+            actions = START.actions(number.view(WORLDS, -1).double().numpy())
+            state, step = game.step(state, actions)
+            reward = torch.from_numpy(step.reward[:, learners - 1]).float().flatten()
+            steps.append((seen, number, policy.log_prob(number), value, reward * running, running))
+        improve(network, optimiser, steps, epochs, noise)
+        spent, first = sum(int(each[5].sum()) for each in steps), first + WORLDS
+        used += spent
+    content = {"observation": observation, "remembers": network.remembers}
+    arrays = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
+    save_file(arrays, folder / "network.safetensors", {"content": json.dumps(content)})
+    return {"start": "the task's", "simulated": used}
+
+
+def improve(network: Recurrent, optimiser: Any, steps: list[Any], epochs: int, noise: float) -> None:
+    """PPO on whole episodes: generalised advantages, and the clipped ratio of probabilities."""
+    seen, number, before, value, reward, running = map(torch.stack, zip(*steps, strict=True))
+    following = torch.cat([value[1:] * running[1:], torch.zeros_like(value[:1])])
+    advantage = reward + following - value
+    for step in range(len(steps) - 2, -1, -1):
+        advantage[step] += TRACE * advantage[step + 1] * running[step + 1]
+    target, gain = advantage + value, advantage[running]
+    advantage = (advantage - gain.mean()) / (gain.std() + 1e-8)
+    for _ in range(epochs):
+        memory, means, values = torch.zeros(seen.shape[1], HIDDEN), [], []
+        for observations in seen:
+            mean, guess, memory = network(observations, memory)
+            means.append(mean)
+            values.append(guess)
+        policy: Any = torch.distributions.Normal(torch.stack(means), noise)
+        ratio = (policy.log_prob(number) - before).exp()
+        gained = torch.minimum(ratio * advantage, ratio.clamp(1 - RATIO, 1 + RATIO) * advantage)[running].mean()
+        loss: Any = 0.5 * ((torch.stack(values) - target)[running] ** 2).mean() - gained
         optimiser.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 0.5)
+        nn.utils.clip_grad_norm_(network.parameters(), CLIP)
         optimiser.step()
-        if update % 10 == 9:
-            mean = state.harm(args.harm_count).mean()
-            print(f"update {update + 1}: {COUNTS[args.harm_count].words} {mean:.2f} m2/s2", flush=True)
-    return network
 
 
 # 4. The agent that the command line makes from this file and the folder. Its memory is an array with a row per world.
@@ -104,7 +127,7 @@ def make_agent(folder: str, settings: eb.AgentSettings) -> eb.Agent:
 
     def decide(seen: Any, memory: Any) -> tuple[Any, Any]:
         with torch.no_grad():
-            mean, memory = network(torch.from_numpy(seen.copy()), torch.from_numpy(memory.copy()))
+            mean, _, memory = network(torch.from_numpy(seen.copy()), torch.from_numpy(memory.copy()))
         return mean[:, None].numpy(), memory.numpy()
 
     return eb.policy_agent(
@@ -113,27 +136,21 @@ def make_agent(folder: str, settings: eb.AgentSettings) -> eb.Agent:
         observation=content["observation"],
         initial_state=lambda n: torch.zeros(n, HIDDEN).numpy(),
         clip=True,
+        actions=START,
     )
 
 
-def main() -> None:
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenario", default="cooperation-3-congested")
+    parser.add_argument("--scenario", default="benchmark-blocked")
     parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--updates", type=int, default=200)
-    parser.add_argument("--worlds", type=int, default=256)
+    parser.add_argument("--decisions", type=int, default=200_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--harm-count", choices=[*COUNTS], default="honest", help="what the reward counts")
     parser.add_argument("--memoryless", action="store_true")
     args = parser.parse_args()
-    scenario = eb.load_scenario(args.scenario)
-    observation = list(scenario.observation or OBSERVATION)
     with new_folder(args.output) as folder:
-        network = train(scenario, observation, args)
-        content = {"observation": observation, "remembers": network.remembers}
-        arrays = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-        save_file(arrays, folder / "network.safetensors", {"content": json.dumps(content)})
-
-
-if __name__ == "__main__":
-    main()
+        train(
+            eb.load_scenario(args.scenario), args.seed, args.decisions, folder,
+            harm_count=args.harm_count, memoryless=args.memoryless,
+        )  # fmt: skip

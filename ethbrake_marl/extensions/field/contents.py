@@ -9,6 +9,7 @@ CONTENTS = {
         "r157_human": "controllers:R157_HUMAN",
         "r157_fsm": "controllers:R157_FSM",
         "aeb": "controllers:AEB",
+        "synchronised": "synchronised:AGENT",
         "field": "controllers:FIELD",
     },
     "measures": {"ttc_s": "measures:TTC", "drac_mps2": "measures:DRAC", "whose_front": "measures:WHOSE_FRONT"},
