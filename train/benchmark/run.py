@@ -1,13 +1,17 @@
 """Train methods on tasks with several seeds, and evaluate them: a row for each. Read it from top to bottom.
 
-    python train/benchmark/run.py --tasks benchmark-pair --methods sb3-ppo mine.py:train --output runs/benchmark
+    python train/benchmark/run.py --tasks benchmark-pair --methods sb3-ppo cem=mine.py:train --output runs/benchmark
     python train/benchmark/run.py --tasks paper-random --methods ppo sac --list-seed 8 --output runs/sweep
 
-A method is a name of `METHODS`, a recipe (its name or file), or `FILE.py:FUNCTION`. Such a function
+A method is a name of `METHODS`, a recipe (its name or file), or `NAME=FILE.py:FUNCTION`. Such a function
 `train(task, seed, decisions, folder)` trains with that many decisions of all learners together, and saves what it has
-learned in `folder`; `make_agent(folder, settings)` of the same file makes the agent or team of it. Before its first
-training in a task every method trains once with one decision, in another folder, so that compiling is no part of the
-measured processor time `cpu_s`.
+learned in `folder`; `make_agent(folder, settings)` of the same file makes the agent or team of it. `train` may return a
+mapping: `simulated`, all decisions that it has simulated, those of branches and searches included, and `start`, `the
+task's` for a method that takes `START` of the tasks. Before its first training in a task every method trains once with
+one decision, in another folder, so that compiling is no part of the measured processor time `cpu_s`.
+
+`--held-out FOLDER` evaluates on a second list, too, whose seed follows from the method's committed trials and rows, the
+files `trials/METHOD.csv` and `METHOD.csv` of the folder; so it exists only when both have ended.
 
 Each training has a folder in `OUTPUT/runs`, and each evaluated one a file in `OUTPUT/rows`. After an interruption,
 start the same command again: finished trainings are skipped, and an unfinished one of a recipe goes on from its last
@@ -57,8 +61,10 @@ METHODS = {
     "iql": f"{HERE}/marl.py:iql",
     "clone": f"{HERE}/clone.py:clone",
     "cooperation": f"{HERE}/vine.py:cooperation",
+    "recurrent-ppo": f"{HERE.parent}/recurrent.py:train",
 }
 WARM: set[tuple[str, str]] = set()  # tasks and methods for which this process has compiled everything
+OF_A_TRAINING = ("decisions", "simulated", "start", "cpu_s")  # columns that rules leave empty
 ABOUT = "training.json"  # file in the folder of a training by a Python file: decisions, scenario, processor time
 
 
@@ -67,7 +73,8 @@ ABOUT = "training.json"  # file in the folder of a training by a Python file: de
 
 class Job(NamedTuple):
     task: eb.Scenario
-    method: str
+    label: str  # name of the method in tables
+    method: str  # recipe, or FILE.py:FUNCTION
     seed: int
     decisions: int
     output: Path
@@ -75,11 +82,6 @@ class Job(NamedTuple):
     list_seed: int = SEED
     recipe: Training | None = None  # for a method that is a recipe
     settings: tuple[str, ...] = ()
-
-    @property
-    def label(self) -> str:
-        """Name of the method in tables: a file without its folder."""
-        return Path(self.method).name
 
     @property
     def name(self) -> str:
@@ -95,7 +97,7 @@ class Job(NamedTuple):
         """Name of the trained agent, for `--agents`."""
         if self.recipe is not None:
             return f"team@{self.folder}"
-        return f"{METHODS.get(self.method, self.method).rpartition(':')[0]}:make_agent:{self.folder}"
+        return f"{self.method.rpartition(':')[0]}:make_agent:{self.folder}"
 
     def finish(self) -> dict[str, Any]:
         """Train and evaluate, unless that is done; return the row, or one with the `reason` of a failure."""
@@ -137,7 +139,7 @@ class Job(NamedTuple):
                 raise KeyboardInterrupt
             last = read_object(RunFolder(self.folder).status)["evaluations"][-1]
             return {"decisions": last["steps"], "cpu_s": round(last["cpu_s"], 1)}
-        path, function = METHODS.get(self.method, self.method).rsplit(":", 1)
+        path, function = self.method.rsplit(":", 1)
         code = sha256(Path(path).read_bytes()).hexdigest()
         about = {"decisions": self.decisions, "scenario": self.task.content(), "method": function, "sha256": code}
         if not self.folder.exists():
@@ -160,7 +162,24 @@ class Job(NamedTuple):
         result = evaluate_task(self.task, agents, episodes=self.episodes, seed=self.list_seed)
         about = {"method": self.label, "seed": self.seed, **about, "list_seed": self.list_seed}
         braking, own = benchmark_rows({self.task.name: eb.summarise(result)}, **about)
-        return [braking | {"method": "full_brake", "seed": "", "decisions": "", "cpu_s": ""}, own]
+        return [braking | {"method": "full_brake"} | dict.fromkeys(("seed", *OF_A_TRAINING), ""), own]
+
+    def hold_out(self, folder: Path) -> None:
+        """Evaluate on the method's held-out list, unless that is done."""
+        file = self.output / "held-out" / f"{self.name}.csv"
+        if not file.exists():
+            file.parent.mkdir(exist_ok=True)
+            held_out = self._replace(list_seed=held_out_seed(folder, self.label))
+            write_file(file, csv_text(held_out.evaluate(dict.fromkeys(OF_A_TRAINING, ""))).encode())
+
+
+def held_out_seed(folder: Path, method: str) -> int:
+    """Seed of a method's held-out list: from the SHA-256 of its trials and of its costs on the first list."""
+    trials, rows = folder / "trials" / f"{method}.csv", folder / f"{method}.csv"
+    digest = sha256(trials.read_text().encode() if trials.exists() else b"")
+    for row in csv.DictReader(rows.read_text().splitlines()):
+        digest.update("".join(row.get(key) or "" for key in ("task", "agent", "seed", "honest_cost")).encode())
+    return int.from_bytes(digest.digest()[:4])
 
 
 def braking_file(output: Path, task: str) -> Path:
@@ -176,8 +195,12 @@ def read_jobs(args: argparse.Namespace) -> list[Job]:
         raise InvalidInput(f"--jobs {args.jobs}: must be 1 or more")
     if args.decisions is not None and args.decisions < 1:
         raise InvalidInput(f"--decisions {args.decisions}: must be 1 or more")
-    recipes = {name: eb.load_recipe(name) for name in args.methods if name not in METHODS and ".py:" not in name}
-    for path, function in (METHODS.get(name, name).rsplit(":", 1) for name in args.methods if name not in recipes):
+    methods = {}
+    for text in args.methods:
+        name, _, file = text.rpartition("=")
+        methods[name or Path(file).name] = METHODS.get(file, file)
+    recipes = {name: eb.load_recipe(method) for name, method in methods.items() if ".py:" not in method}
+    for path, function in (method.rsplit(":", 1) for name, method in methods.items() if name not in recipes):
         load_from_file(path, function)
         load_from_file(path, "make_agent")
     settings = read_settings(args.set, [key for recipe in recipes.values() for key in type(recipe).model_fields])
@@ -185,11 +208,11 @@ def read_jobs(args: argparse.Namespace) -> list[Job]:
     for name, recipe in recipes.items():
         recipes[name] = settings.change_recipe(recipe.replace(total_steps=args.decisions or recipe.total_steps))
     jobs = []
-    for seed, task, name in product(range(args.seeds), tasks, args.methods):
+    for seed, task, name in product(range(args.first_seed, args.first_seed + args.seeds), tasks, methods):
         recipe = Training.of(recipes[name], task, seed=seed) if name in recipes else None
         options = args.output.absolute(), args.episodes, args.list_seed, recipe, settings.texts
-        jobs.append(Job(task, name, seed, args.decisions or DECISIONS, *options))
-    if not jobs or len({job.folder for job in jobs}) < len(jobs):
+        jobs.append(Job(task, name, methods[name], seed, args.decisions or DECISIONS, *options))
+    if not jobs or len({job.folder for job in jobs}) < args.seeds * len(tasks) * len(args.methods):
         raise InvalidInput("a run needs at least one seed, and each task and each name of a method's file only once")
     return jobs
 
@@ -207,6 +230,8 @@ def run(args: argparse.Namespace) -> int:
                 rows.append(row)
                 result = row.get("reason") or f"honest cost {float(row['honest_cost']):.2f}"
                 print(f"{len(rows)} of {len(jobs)}: {job.name}: {result}", flush=True)
+        for job in jobs if args.held_out else ():
+            job.hold_out(args.held_out)
         for task in dict.fromkeys(job.task.name for job in jobs):
             file = braking_file(args.output, task)
             rows += csv.DictReader(file.read_text().splitlines()) if file.exists() else []
@@ -232,11 +257,13 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", metavar="NAME", help="names or paths of scenarios (default: benchmark)")
     parser.add_argument("--methods", nargs="+", required=True, metavar="NAME", help=f"{', '.join(METHODS)}, ...")
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="seeds 0 to N - 1 (default: 5)")
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="number of seeds (default: 5)")
+    parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="the first of them (default: 0)")
     parser.add_argument("--decisions", type=int, help="of all learners together (default: 200,000, or as in a recipe)")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings of all tasks and recipes")
     parser.add_argument("--episodes", type=int, default=EPISODES, help=f"evaluated worlds (default: {EPISODES})")
     parser.add_argument("--list-seed", type=int, default=SEED, help=f"seed of these worlds (default: {SEED})")
+    parser.add_argument("--held-out", type=Path, metavar="FOLDER", help="committed rows; also use the second list")
     parser.add_argument("--jobs", type=int, metavar="N", help="trainings at the same time (default: 1)")
     parser.add_argument("--ray", metavar="ADDRESS", help="a running Ray cluster, or `local` for Ray on this machine")
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="folder of all results")

@@ -23,7 +23,7 @@ REWARD = {"harm": 0.05, "harm_count": "honest", "shaping": 0.05, "shaping_discou
 
 def ppo(
     task: eb.Scenario, seed: int, decisions: int, folder: Path,
-    learning_rate: float = 1e-3, n_epochs: int = 10, gae_lambda: float = 0.95,
+    learning_rate: float = 2.78e-3, n_epochs: int = 10, gae_lambda: float = 0.9,
 ) -> dict[str, Any]:  # fmt: skip
     settings = {"learning_rate": learning_rate, "n_epochs": n_epochs, "gae_lambda": gae_lambda}
     env = env_of(task, seed)
