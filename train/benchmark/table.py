@@ -6,8 +6,10 @@
 
 Rows come from `train/benchmark/run.py` (one for each task, method and seed) and from `ethbrake evaluate --scenario
 benchmark --output` (one for each task and agent). The first table has the share of the possible reduction (0 for full
-braking, 1 for the best known cost); the second table, also written by `--csv`, has all measures. Both mark agents that
-read hidden values (†). For the committed rows, two more tables follow: differences in honest cost, and cross-play.
+braking, 1 for the best known cost of the shipped tables); the second table, also written by `--csv`, has all measures.
+Both mark agents that read hidden values (†). For the committed rows, two more tables follow: differences in honest
+cost, and the held-out lists. `docs/results/benchmark/variants` has rows of shorter trainings and of other processor
+instructions.
 """
 
 from __future__ import annotations
@@ -15,23 +17,27 @@ from __future__ import annotations
 import argparse
 import csv
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from math import isfinite
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import trim_mean
+from scipy.stats import t, trim_mean
 
+import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.benchmark import BENCHMARK, EPISODES
+from ethbrake_marl.evaluation.evaluate import SEED
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, write_picture
+from ethbrake_marl.extensions.search.limits import least_known_values
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, csv_text
 from ethbrake_marl.files.store import check_target, write_file
 from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.worlds.catalogue import group_of_scenarios
 
 ROWS = Path(__file__).resolve().parents[2] / "docs" / "results" / "benchmark"
-CROSS_PLAY = ROWS / "cross_play"  # matrices of cross_play.py
-Row = Mapping[str, str]
+Row = dict[str, str]
 Cells = dict[tuple[str, str], list[Row]]  # (task, method) -> rows of its seeds
 SHARE = "share_of_possible_reduction_honest"
 MEANS = {  # column of the rows -> column of the table
@@ -46,7 +52,7 @@ NUMBERS = (SHARE, "honest_cost", "best_known_honest", *MEANS)
 OF_A_TASK = ("worlds_sha256", "physics_digest", "best_known_honest")  # columns with one value in all rows of a task
 OF_A_METHOD = ("decisions", "version", "sees_through_channel")  # columns with one value in all seeds of a method
 NEEDED = ("task", "worlds_sha256", "physics_digest", "agent", "sees_through_channel", *NUMBERS)
-OPTIONAL = dict.fromkeys(("seed", "decisions", "cpu_s", "version"), "")
+OPTIONAL = dict.fromkeys(("seed", "decisions", "simulated", "start", "cpu_s", "version"), "")
 PERCENT = Column("", digits=1, scale=100.0, unit=" %")
 
 
@@ -68,7 +74,23 @@ def read_rows(files: Iterable[Path]) -> Cells:
         cell.append(row)
     if not cells:
         raise InvalidInput("no rows: needs a file of run.py or of evaluate")
+    for task in tasks_of(cells):
+        rate(cells, task)
     return cells
+
+
+def rate(cells: Cells, task: str) -> None:
+    """Shares anew, from the shipped table of best known costs, for rows of the first list of a task."""
+    rows = [row for (at, _), seeds in cells.items() if at == task for row in seeds]
+    episodes = {row.get("episodes") for row in rows}
+    if task in group_of_scenarios(BENCHMARK) and (task, "full_brake") in cells and len(episodes) == 1:
+        scenario, game = eb.open_game(task)
+        worlds = scenario.sample(int(episodes.pop() or EPISODES), SEED)
+        best = float(least_known_values(game, worlds)["honest"].mean())
+        full = float(cells[task, "full_brake"][0]["honest_cost"])
+        for row in rows:
+            row["best_known_honest"] = f"{best:.9g}"
+            row[SHARE] = repr((full - float(row["honest_cost"])) / (full - best))
 
 
 def checked_rows(file: Path) -> Iterator[Row]:
@@ -168,8 +190,12 @@ def table(cells: Cells) -> list[dict[str, str]]:
                 "method": method + mark_of(cells, task, method),
                 "seeds": f"{len(seeds)}",
                 "decisions": f"{int(decisions):,}" if decisions else "",
+                "simulated": factor_of(cells, task, method),
+                "start": seeds[0]["start"],
                 "CPU s": f"{np.mean(spent):.0f}" if spent else "",
                 "share of the possible": PERCENT.show(shares_of(cells, task, method)).in_words,
+                "a further training": further(float(row[SHARE]) for row in seeds),
+                "better than the next": improvement(cells, task, method),
                 "honest cost": interquartile_mean(float(row["honest_cost"]) for row in seeds).in_words(),
                 **{name: f"{mean:.2f}" for name, mean in means.items()},
                 "collisions": PERCENT.show(means["collisions"]).value,
@@ -179,27 +205,63 @@ def table(cells: Cells) -> list[dict[str, str]]:
     return rows
 
 
+def factor_of(cells: Cells, task: str, method: str) -> str:
+    """Simulated decisions for each decision of the budget; empty for rules."""
+    ratios = [int(row["simulated"]) / int(row["decisions"]) for row in cells[task, method] if row["simulated"]]
+    return f"{np.mean(ratios):,.0f}" if ratios else ""
+
+
+def further(values: Iterable[float]) -> str:
+    """Prediction interval (Student's t) of one more training, which is wider than that of the mean."""
+    numbers = np.array([*values])
+    if len(numbers) < 3:
+        return ""
+    half = t.ppf(0.975, len(numbers) - 1) * numbers.std(ddof=1) * (1.0 + 1.0 / len(numbers)) ** 0.5
+    return PERCENT.show(Estimate(float(numbers.mean()), (numbers.mean() - half, numbers.mean() + half))).in_words
+
+
+def improvement(cells: Cells, task: str, method: str) -> str:
+    """Probability that a training is better than one of the next method in the table, with a bootstrap interval."""
+    methods = methods_of(cells, task)
+    pair = methods[methods.index(method) :][:2]
+    if len(pair) < 2 or len(cells[task, method]) < 2:
+        return ""
+    one, other = (np.array([float(row[SHARE]) for row in cells[task, name]]) for name in pair)
+    first, second = redrawn(one, 0)[:, :, np.newaxis], redrawn(other, 1)[:, np.newaxis]
+    drawn = ((first > second) + 0.5 * (first == second)).mean(axis=(1, 2))
+    value = (one[:, np.newaxis] > other).mean() + 0.5 * (one[:, np.newaxis] == other).mean()
+    return PERCENT.show(Estimate(float(value), percentiles(drawn))).in_words
+
+
 def best_known(cells: Cells, task: str) -> str:
     (row, *_), *_ = (rows for (at, _), rows in cells.items() if at == task)
     return f"{float(row['best_known_honest']):.2f}"
 
 
 def overview(cells: Cells) -> list[dict[str, str]]:
-    """The share of each method (row) in each task (column), the best mean first, and the scale."""
-    tasks = tasks_of(cells)
-    shares: dict[str, dict[str, Estimate]] = defaultdict(dict)
-    texts: dict[str, dict[str, str]] = defaultdict(lambda: dict.fromkeys(tasks, DASH))
-    for task, method in cells:
-        shares[method][task] = shares_of(cells, task, method)
-        texts[method][task] = PERCENT.show(shares[method][task]).in_words + mark_of(cells, task, method)
-    rows = []
-    for method in sorted(shares, key=lambda method: -np.mean([share.value for share in shares[method].values()])):
-        rows.append({"method": method} | texts[method])
+    """The share of each method (row) in each task (column), and the scale.
+
+    First methods that simulate only their decisions, then those that simulate more, then rules; in each group the best
+    in the task of most methods first.
+    """
+    tasks, rows = tasks_of(cells), []
+    usual = max(tasks, key=lambda task: len(methods_of(cells, task)))
+    for method in dict.fromkeys(method for _, method in cells):
+        own = [task for task in tasks if (task, method) in cells]
+        factors = [int(factor.replace(",", "")) for task in own if (factor := factor_of(cells, task, method))]
+        factor = f"{min(factors):,} to {max(factors):,}".partition(f" to {min(factors):,}")[0] if factors else DASH
+        shares = {task: shares_of(cells, task, method) for task in own}
+        texts = {task: PERCENT.show(shares[task]).in_words + mark_of(cells, task, method) for task in own}
+        group = 2 if not factors else int(max(factors) > 1)
+        best = shares.get(usual, Estimate(-1.0, None)).value
+        rows.append((group, -best, {"method": method, "simulated": factor} | dict.fromkeys(tasks, DASH) | texts))
     full = {task: cells[task, "full_brake"][0]["honest_cost"] for task in tasks if (task, "full_brake") in cells}
     costs = {task: f"{float(full[task]):.2f}" if task in full else DASH for task in tasks}
-    rows.append({"method": "full braking, honest cost"} | costs)
-    rows.append({"method": "best known, honest cost"} | {task: best_known(cells, task) for task in tasks})
-    return rows
+    best_costs = {task: best_known(cells, task) for task in tasks}
+    return [row for _, _, row in sorted(rows, key=lambda row: row[:2])] + [
+        {"method": "full braking, honest cost", "simulated": ""} | costs,
+        {"method": "best known, honest cost", "simulated": ""} | best_costs,
+    ]
 
 
 def differences(cells: Cells) -> list[dict[str, str]]:
@@ -219,23 +281,28 @@ def differences(cells: Cells) -> list[dict[str, str]]:
     return rows
 
 
-def cross_play(files: Iterable[Path]) -> list[dict[str, str]]:
-    """Mean honest cost on and off the diagonal of each matrix, with bootstrap intervals over the teams."""
+def held_out(cells: Cells, files: Iterable[Path]) -> list[dict[str, str]]:
+    """How much of full braking's cost each method saves on the first list and on its held-out list, mean of its tasks.
+
+    A file of rows on a held-out list also has the rows of full braking.
+    """
     rows = []
     for file in sorted(files):
-        pairings = [*csv.DictReader(file.read_text().splitlines())]
-        cost = np.array([float(row["honest_cost"]) for row in pairings])
-        teams = round(len(cost) ** 0.5)
-        cost = cost.reshape(teams, teams)
-        drawn = redrawn(np.arange(teams), 0)
-        drawn = drawn[(drawn != drawn[:, :1]).any(axis=1)]  # samples with two teams or more
-        apart = drawn[:, :, None] != drawn[:, None, :]
-        off = np.where(apart, cost[drawn[:, :, None], drawn[:, None, :]], np.nan)
-        means = {"on": cost.diagonal()[drawn].mean(axis=1), "off": np.nanmean(off, axis=(1, 2))}
-        values = {"on": cost.diagonal().mean(), "off": cost[~np.eye(teams, dtype=bool)].mean()}
-        ends = {f"{at} the diagonal": Estimate(values[at], percentiles(means[at])).in_words() for at in means}
-        rows.append({"task": pairings[0]["task"], "method": file.stem.partition(".")[2]} | ends)
+        others: Cells = defaultdict(list)
+        for row in csv.DictReader(file.read_text().splitlines()):
+            others[row["task"], row["method"]].append(row)
+        for method in sorted({method for _, method in others} - {"full_brake"}):
+            tasks = [task for task, name in others if name == method]
+            saved = [np.mean([saving(lists, task, method) for task in tasks]) for lists in (cells, others)]
+            first, second = (PERCENT.show(Estimate(float(value), None)).value for value in saved)
+            seed = others[tasks[0], method][0]["list_seed"]
+            rows.append({"method": method, "saved, first list": first, "held-out list": second, "its seed": seed})
     return rows
+
+
+def saving(cells: Cells, task: str, method: str) -> float:
+    cost, full = ([float(row["honest_cost"]) for row in cells[task, name]] for name in (method, "full_brake"))
+    return float(1.0 - trim_mean(cost, 0.25) / full[0])
 
 
 def tasks_of(cells: Cells) -> list[str]:
@@ -291,8 +358,8 @@ if __name__ == "__main__":
         figure = draw(cells) if args.figure else None
         tables = [overview(cells), table(cells)]
         if not args.rows:
-            tables += [differences(cells), cross_play(CROSS_PLAY.glob("*.csv"))]
-        print("\n\n".join(text_of(rows) for rows in tables))
+            tables += [differences(cells), held_out(cells, (ROWS / "held_out").glob("*.csv"))]
+        print("\n\n".join(text_of(rows) for rows in tables if rows))
         if args.csv:
             write_file(args.csv, csv_text(table(cells)).encode())
         if figure:

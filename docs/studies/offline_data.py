@@ -1,6 +1,6 @@
 """The offline data set of a task: E-V2X-BM, `plan` and random commands in the worlds of seed 1.
 
-    python train/benchmark/data.py benchmark-single benchmark-single.parquet
+    python docs/studies/offline_data.py benchmark-single benchmark-single.parquet
 
 Prints the SHA-256 of the columns, which does not depend on versions. Use one agent's rows, or all rows as mixed data.
 """
