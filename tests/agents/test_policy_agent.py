@@ -22,6 +22,7 @@ from stable_baselines3.common import vec_env
 from stable_baselines3.common.monitor import Monitor
 
 from ethbrake_marl.agent_names import open_game
+from ethbrake_marl.agents.action_scale import ActionScale
 from ethbrake_marl.agents.policy_agent import LearnedAgent, policy_agent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.agents.team import Agent, Team, play_to_end
@@ -203,6 +204,22 @@ def test_indices__stand_for_evenly_spaced_actions() -> None:
     for index in range(5):
         agent = policy_agent(lambda seen, i=index: np.full(len(seen), i), actions=5)
         assert actions(agent) == pytest.approx([-1.0 + 0.5 * index] * 12)
+
+
+def test_scale__is_that_of_the_environment_in_which_a_model_was_trained(tmp_path: Path) -> None:
+    start = ActionScale(offset=-0.9, scale=0.3)
+    env = make_sb3_vec_env(PAPER, 2, seed=1, actions=start)
+    model = stable.PPO("MlpPolicy", env, n_steps=4, batch_size=8, policy_kwargs=TINY)
+    model.save(tmp_path / "model.zip")
+    loaded = stable.PPO.load(tmp_path / "model.zip")
+    agent = policy_agent(loaded)
+    assert agent.actions == start
+    numbers = loaded.predict(agent.observe(agent.observation, GAME.reset(sampled()), 2), deterministic=True)[0][:, 0]
+    assert actions(agent) == pytest.approx(np.clip(-0.9 + 0.3 * numbers, -1, 1)) and min(actions(agent)) < -0.8
+    chosen = policy_agent(lambda seen: np.full(len(seen), 1), actions=start._replace(count=3))
+    assert actions(chosen) == pytest.approx([-0.9] * 12)
+    with pytest.raises(AgentFailed, match=r"must be a number in \[-3, 3\]"):
+        actions(policy_agent(lambda seen: np.full(len(seen), 3.1), actions=start))
 
 
 def test_clip__means_the_nearest_action_and_one_float32_step_beyond_is_always_1() -> None:

@@ -6,9 +6,11 @@ import re
 import runpy
 import sys
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import ethbrake_marl as eb
@@ -22,8 +24,9 @@ from tests.refused import refused
 
 FOLDER = Path(__file__).resolve().parents[2] / "train" / "benchmark"
 table = load(FOLDER / "table")
-cross_play = load(FOLDER / "cross_play")
-data = load(FOLDER / "data")
+run = load(FOLDER / "run")
+cross_play = load("cross_play")
+data = load("offline_data")
 PNG = b"\x89PNG"
 SCALE = {"honest_cost": "30", "best_known_honest": "10", "sees_through_channel": "False"}
 MEANS = dict.fromkeys(table.MEANS, "1")
@@ -165,21 +168,82 @@ def test_differences__of_two_methods_and_of_two_tasks_by_hand(tmp_path: Path) ->
     assert blocked["cell"] == "benchmark-blocked, ippo" and blocked["honest cost"] == "3.00 [3.00, 3.00]"
 
 
-def test_cross_play__has_the_means_on_and_off_the_diagonal(tmp_path: Path) -> None:
-    file = tmp_path / "benchmark-pair.mine.csv"
-    cost = [[1, 5, 6], [5, 1, 4], [6, 4, 1]]
-    pairings = [{"task": "benchmark-pair", "honest_cost": value} for row in cost for value in row]
-    file.write_text(csv_text(pairings))
-    [row] = table.cross_play([file])
-    assert (row["task"], row["method"], row["on the diagonal"]) == ("benchmark-pair", "mine", "1.00 [1.00, 1.00]")
-    assert row["off the diagonal"] == "5.00 [4.00, 6.00]"  # a sample has two teams or three
+def test_further_training__lies_in_the_interval_of_student() -> None:
+    # mean 3, deviation sqrt(2.5), t = 2.776 with 4 degrees of freedom: 3 +- 2.776 sqrt(2.5) sqrt(1.2) = 3 +- 4.81
+    assert table.further([0.01, 0.02, 0.03, 0.04, 0.05]) == "3.0 % [-1.8, 7.8]"
+    assert table.further([0.5, 0.6]) == ""
+
+
+def test_improvement__is_the_share_of_pairs_that_are_better(tmp_path: Path) -> None:
+    costs = {"m": (10, 14, 16), "n": (15, 16, 20)}  # 3 + 3 + 1.5 of 9 pairs
+    rows = [
+        {"agent": method, "seed": seed, "decisions": 100, "simulated": factor * 100, "honest_cost": cost}
+        for factor, (method, seeds) in enumerate(costs.items(), 1)
+        for seed, cost in enumerate(seeds)
+    ]
+    cells = table.read_rows([rows_file(tmp_path / "m.csv", *rows)])
+    better, last, _ = (row.get("better than the next") for row in table.table(cells))
+    assert better.startswith("83.3 % [") and last == ""
+    assert [row["simulated"] for row in table.overview(cells)] == ["1", "2", "", ""]
+
+
+def test_rows__of_a_task_have_the_shares_of_the_shipped_table(tmp_path: Path) -> None:
+    result = evaluate_task(eb.load_scenario("benchmark-pair"), "full_brake,constant:6", episodes=40)
+    rows = benchmark_rows({"benchmark-pair": eb.summarise(result)}, method="")
+    true = [row[table.SHARE] for row in rows]
+    (tmp_path / "a.csv").write_text(csv_text([{**row, table.SHARE: 0.5, "best_known_honest": 1.0} for row in rows]))
+    cells = table.read_rows([tmp_path / "a.csv"])
+    read = [float(cells["benchmark-pair", name][0][table.SHARE]) for name in ("full_brake", "constant:6")]
+    assert read == pytest.approx(true) and abs(true[1]) > 0.01
+
+
+def test_held_out_list__has_a_seed_that_depends_on_trials_and_costs(tmp_path: Path) -> None:
+    (tmp_path / "trials").mkdir()
+    row = {"task": "benchmark-pair", "agent": "m", "method": "m", "seed": "0", "honest_cost": "2"}
+    seeds = []
+    for trials, cost in (("a", "2"), ("b", "2"), ("b", "3"), ("b", "3")):
+        (tmp_path / "trials" / "m.csv").write_text(trials)
+        (tmp_path / "m.csv").write_text(csv_text([{**row, "honest_cost": cost}]))
+        seeds.append(run.held_out_seed(tmp_path, "m"))
+    assert len({*seeds}) == 3 and seeds[2] == seeds[3]
+    full = {"task": "benchmark-pair", "agent": "full_brake", "method": "full_brake", "list_seed": "9"}
+    (tmp_path / "second.csv").write_text(csv_text([{**full, "honest_cost": "10"}, {**row, "list_seed": "9"}]))
+    cells = {("benchmark-pair", "m"): [{"honest_cost": "3"}], ("benchmark-pair", "full_brake"): [{"honest_cost": "4"}]}
+    [saved] = table.held_out(cells, [tmp_path / "second.csv"])
+    assert [*saved.values()] == ["m", "25.0 %", "80.0 %", "9"]
+
+
+def test_held_out_rows__are_of_the_lists_that_follow_from_trials_and_rows() -> None:
+    files = [*(table.ROWS / "held_out").glob("*.csv")]
+    assert len(files) >= 3
+    for file in files:
+        assert {row["list_seed"] for row in rows_of(file)} == {f"{run.held_out_seed(table.ROWS, file.stem)}"}
+
+
+def test_methods__have_the_settings_of_their_best_trials() -> None:
+    trials = [*(table.ROWS / "trials").glob("*.csv")]
+    assert len(trials) >= 7 and len({len(rows_of(file)) for file in trials}) == 1
+    for file in trials:
+        best = min(rows_of(file), key=lambda row: float(row["harm"]))
+        path, function = run.METHODS[file.stem].rsplit(":", 1)
+        if file.stem not in ("ippo", "mappo", "iql") or find_spec("benchmarl"):
+            known = signature(getattr(load(Path(path).with_suffix("")), function)).parameters
+            for name, value in best.items():
+                if name not in ("trial", "harm"):
+                    assert known[name].default == pytest.approx(float(value), rel=0.01), (file.stem, name)
+
+
+def test_cross_play__has_the_means_on_and_off_the_diagonal() -> None:
+    on, off = cross_play.summary(np.array([[1.0, 5.0, 6.0], [5.0, 1.0, 4.0], [6.0, 4.0, 1.0]]))
+    assert on.in_words() == "1.00 [1.00, 1.00]"
+    assert off.in_words() == "5.00 [4.00, 6.00]"  # a sample has two teams or three
 
 
 def test_tables__on_the_page_and_in_a_file_are_those_of_the_committed_rows() -> None:
     results = FOLDER.parents[1] / "docs" / "results"
     page, cells = (results / "benchmark.md").read_text("utf-8"), table.read_rows(table.ROWS.glob("*.csv"))
     assert table.text_of(table.overview(cells)) in page
-    assert table.text_of(table.cross_play(table.CROSS_PLAY.glob("*.csv"))) in page
+    assert table.text_of(table.held_out(cells, (table.ROWS / "held_out").glob("*.csv"))) in page
     assert csv_text(table.table(cells)) == (results / "benchmark.csv").read_text("utf-8")
     tables = [table.overview(cells), table.table(cells), table.differences(cells)]
     values = {value for rows in tables for row in rows for value in row.values()}
@@ -202,25 +266,25 @@ def test_figure__is_drawn_from_the_committed_rows() -> None:
 
 def test_cross_play__of_two_teams_by_hand() -> None:
     names, cost = cross_play.cross_play("benchmark-pair", ["full_brake", "constant:5"])
-    assert names == ["full_brake", "constant:5"] and cost.shape == (2, 2, 2000)
+    assert names == ["full_brake", "constant:5"] and cost.shape == (2, 2)
     drivers = {"vehicle_2": "full_brake", "vehicle_3": "constant:5"}
     mixed = eb.evaluate("benchmark-pair", {"mixed": drivers}, episodes=2000)["mixed"]["honest_cost"]
-    assert cost[0, 1].tolist() == mixed.tolist()
+    assert cost[0, 1] == mixed.mean()
     with refused("needs two agents or more, and two learners or more"):
         cross_play.cross_play("benchmark-single", ["full_brake", "constant:5"])
 
 
-def run_script(monkeypatch: pytest.MonkeyPatch, name: str, *words: str) -> None:
-    monkeypatch.setattr(sys, "argv", [f"{name}.py", *words])
-    runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
+def run_script(monkeypatch: pytest.MonkeyPatch, path: Path, *words: str) -> None:
+    monkeypatch.setattr(sys, "argv", [path.name, *words])
+    runpy.run_path(str(path), run_name="__main__")
 
 
-@pytest.mark.parametrize("words", ["cross_play benchmark-pair coast full_brake --csv", "table --csv", "table --figure"])
+@pytest.mark.parametrize("word", ["--csv", "--figure"])
 def test_file__that_cannot_be_written_is_refused_before_the_work(
-    empty_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: str
+    empty_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, word: str
 ) -> None:
     with pytest.raises(SystemExit, match="2"):
-        run_script(monkeypatch, *words.split(), "none/x.png")
+        run_script(monkeypatch, FOLDER / "table.py", word, "none/x.png")
     out, err = capsys.readouterr()
     assert out == "" and "the folder none does not exist; create it first" in err
 
@@ -230,12 +294,14 @@ def test_data__of_a_task_has_the_same_digest_twice(
 ) -> None:
     pytest.importorskip("pyarrow")
     for name in ("one", "two"):
-        run_script(monkeypatch, "data", "benchmark-all", str(tmp_path / f"{name}.parquet"), "--episodes", "3")
+        words = "benchmark-all", str(tmp_path / f"{name}.parquet"), "--episodes", "3"
+        run_script(monkeypatch, Path(data.__file__), *words)
     one, two = (line.rpartition(" ")[2] for line in capsys.readouterr().out.splitlines())
     assert one == two == data.digest(tmp_path / "one.parquet")
 
 
 METHODS = [("sb3", "ppo"), ("sb3", "sac"), ("clone", "clone"), ("marl", "ippo"), ("marl", "mappo"), ("marl", "iql")]
+METHODS += [("vine", "cooperation")]
 
 
 @pytest.mark.slow
@@ -245,7 +311,8 @@ def test_method__saves_what_its_agent_drives(file: str, method: str, tmp_path: P
     if file == "marl" and find_spec("benchmarl") is None:
         pytest.skip("needs the extra marl")
     module, task = load(FOLDER / file), eb.load_scenario("benchmark-pair")
-    getattr(module, method)(task, 0, 5_000, tmp_path)
+    told = getattr(module, method)(task, 0, 5_000, tmp_path)
+    assert told["start"] and (told.get("simulated", 5_000) > 50_000) == (file in ("clone", "vine"))
     agents = {"full_brake": "full_brake", "mine": f"{FOLDER / file}.py:make_agent:{tmp_path}"}
     result = evaluate_task(task, agents, episodes=50)
     rows = benchmark_rows({"benchmark-pair": eb.summarise(result)}, method=method)

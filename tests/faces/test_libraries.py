@@ -181,7 +181,7 @@ def test_spaces__are_taken_by_every_function_of_gymnasium_on_spaces() -> None:
             assert data_equivalence(unflatten(space, flat), samples[0])
             assert copy.deepcopy(space) == pickle.loads(pickle.dumps(space)) == space
         same = pickle.loads(pickle.dumps(alone))
-        for name in ("features", "evenly_spaced"):
+        for name in ("features", "evenly_spaced", "scale"):
             assert getattr(same, name, None) == getattr(alone, name, None)
 
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from pettingzoo.utils.conversions import parallel_to_aec
 
+from ethbrake_marl.agents.action_scale import ActionScale
 from ethbrake_marl.episode.full_state import full_state
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
 from ethbrake_marl.faces.shield import shield
 from tests.contract.interfaces import CRASH, PAPER
@@ -94,6 +96,22 @@ def test_indices__are_evenly_spaced_actions() -> None:
         infos = env.step({"vehicle_2": index, "vehicle_3": [np.int64(4 - index)]})[4]
         assert infos["vehicle_2"]["chosen_action"] == pytest.approx(index / 2 - 1)
         assert infos["vehicle_3"]["chosen_action"] == pytest.approx(1 - index / 2)
+
+
+def test_scale__moves_and_clips_the_numbers_and_indices_of_an_environment() -> None:
+    start = ActionScale(offset=-0.9, scale=0.3)
+    env = began(scenario="cooperation-3-pair", actions=start)
+    assert env.action_space("vehicle_2").high == [3.0] and env.action_space("vehicle_2").low == [-3.0]
+    for number, action in ((0.0, -0.9), (-1.0, -1.0), (2.0, -0.3), (3.0, 0.0)):
+        assert env.step({"vehicle_2": number, "vehicle_3": 0.0})[4]["vehicle_2"]["chosen_action"] == pytest.approx(
+            action
+        )
+    env = began(scenario="cooperation-3-pair", actions=start._replace(count=3))
+    for index, action in enumerate((-1.0, -0.9, 0.0)):
+        assert env.step({"vehicle_2": index, "vehicle_3": 0})[4]["vehicle_2"]["chosen_action"] == pytest.approx(action)
+    for bad in (start._replace(scale=0.0), start._replace(offset=-1.1), start._replace(count=1)):
+        with pytest.raises(InvalidInput, match="actions = "):
+            EthBrakeParallelEnv(actions=bad)
 
 
 REFUSED: dict[str, Callable[[], Any]] = {

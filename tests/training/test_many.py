@@ -134,6 +134,20 @@ def test_run__of_a_method_of_ones_own(run: Run, empty_folder: Path, capsys: pyte
     assert "has a training with other settings or another file" in capsys.readouterr().out
 
 
+def test_tune__of_a_method_of_ones_own(run: Run, empty_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("mine.py").write_text(
+        METHOD.replace("decisions, folder):", "decisions, folder, brake=6):").replace("6 - seed", "brake")
+    )
+    words = ("tune", "--scenario", "benchmark-pair", "--recipe", "mine.py:train", "--trials", "2", "--output", "new")
+    assert run(*words, "--search", "brake=4/5") == 0
+    trials = {row["brake"]: float(row["harm"]) for row in rows_of(Path("new/trials.csv"))}
+    for brake, harm in trials.items():
+        agents = {"mine": f"constant:{brake}"}
+        assert harm == eb.evaluate("benchmark-pair", agents, episodes=2000, seed=8)["mine"]["honest_cost"].mean()
+    assert run(*words, "--search", "brakes=4/5") == 2
+    assert "has no setting 'brakes'" in capsys.readouterr().err
+
+
 def test_run__goes_on_after_a_failure(run: Run, empty_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("mine.py").write_text(METHOD.replace("(folder /", "1 / seed; (folder /"))
     Path("half.py").write_text(METHOD.replace("def make_agent", "def make"))

@@ -7,6 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import group, make_agent
+from ethbrake_marl.episode.state import TIME
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.extensions.field.controllers import LAWS, KnownMotion, Parameters, fuzzy_criteria
 from ethbrake_marl.motion.layout import GAP
@@ -98,6 +99,19 @@ def test_vehicle_1__brakes_for_nothing_without_an_obstacle(spec: str, command: f
     commands, _ = agent.act(worlds, agent.begin(worlds, 1), 1)
     assert commands.round(3).tolist() == [command]
     assert (agent.name, agent.knows) == (spec, "messages")
+
+
+def test_synchronised__waits_for_the_slowest_and_brakes_as_the_weakest() -> None:
+    slow = TWO.replace(latency_s=[0.2, 0.7], braking_capacity_mps2=[5, 8])
+    agent, alert = eb.make_agent("synchronised", scenario=slow), slow.sample(1, 7)
+    clock = alert.clock.copy()
+    clock[:, TIME] = 0.7
+    later = alert._replace(clock=clock)
+    for body in (1, 2):
+        assert agent.act(alert, None, body)[0].tolist() == [0.0]
+        assert agent.act(later, None, body)[0].tolist() == [-5.0]
+    unknown = later._replace(know=np.full_like(alert.know, np.inf))
+    assert agent.act(unknown, None, 2)[0].tolist() == [-8.0]
 
 
 def test_vehicle_1__brakes_for_an_obstacle_that_stands() -> None:
