@@ -16,7 +16,7 @@ REACH = 3.0  # an untrained Gaussian policy (mean 0, deviation 1) rarely chooses
 class ActionScale(NamedTuple):
     """The number a that a policy chooses stands for the action ``offset + scale * a``, clipped to [-1, 1].
 
-    Environments then have numbers from -3 to 3 or, with ``count``, indices of so many evenly spaced ones.
+    Environments then have numbers from -3 to 3 or, with ``choices``, indices of so many evenly spaced ones.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -27,7 +27,7 @@ class ActionScale(NamedTuple):
 
     offset: float
     scale: float
-    count: int | None = None
+    choices: int | None = None
 
     def actions(self, numbers: Floats) -> Floats:
         """Actions in [-1, 1]."""
@@ -39,7 +39,7 @@ ActionForm = int | ActionScale | None  # number of evenly spaced actions, a scal
 
 def count_in(form: ActionForm, who: str = "actions") -> int | None:
     """Number of indices, or None for numbers. Raises ``InvalidInput``, beginning with ``who``."""
-    count = form.count if isinstance(form, ActionScale) else form
+    count = form.choices if isinstance(form, ActionScale) else form
     if isinstance(form, ActionScale) and not (-1.0 <= form.offset <= 1.0 and 0.0 < form.scale < math.inf):
         raise InvalidInput(f"{who} = {form}: the offset must be from -1 to 1, and the scale above 0")
     if count is not None:

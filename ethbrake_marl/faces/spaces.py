@@ -52,7 +52,7 @@ def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, form
     checked later, in ``Game.step``.
     """
     scale = form if isinstance(form, ActionScale) else None
-    count = form.count if isinstance(form, ActionScale) else form
+    count = form.choices if isinstance(form, ActionScale) else form
     try:
         numbers = np.asarray(actions)
     except ValueError:  # lists of different lengths

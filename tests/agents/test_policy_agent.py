@@ -216,7 +216,7 @@ def test_scale__is_that_of_the_environment_in_which_a_model_was_trained(tmp_path
     assert agent.actions == start
     numbers = loaded.predict(agent.observe(agent.observation, GAME.reset(sampled()), 2), deterministic=True)[0][:, 0]
     assert actions(agent) == pytest.approx(np.clip(-0.9 + 0.3 * numbers, -1, 1)) and min(actions(agent)) < -0.8
-    chosen = policy_agent(lambda seen: np.full(len(seen), 1), actions=start._replace(count=3))
+    chosen = policy_agent(lambda seen: np.full(len(seen), 1), actions=start._replace(choices=3))
     assert actions(chosen) == pytest.approx([-0.9] * 12)
     with pytest.raises(AgentFailed, match=r"must be a number in \[-3, 3\]"):
         actions(policy_agent(lambda seen: np.full(len(seen), 3.1), actions=start))

@@ -106,10 +106,10 @@ def test_scale__moves_and_clips_the_numbers_and_indices_of_an_environment() -> N
         assert env.step({"vehicle_2": number, "vehicle_3": 0.0})[4]["vehicle_2"]["chosen_action"] == pytest.approx(
             action
         )
-    env = began(scenario="cooperation-3-pair", actions=start._replace(count=3))
+    env = began(scenario="cooperation-3-pair", actions=start._replace(choices=3))
     for index, action in enumerate((-1.0, -0.9, 0.0)):
         assert env.step({"vehicle_2": index, "vehicle_3": 0})[4]["vehicle_2"]["chosen_action"] == pytest.approx(action)
-    for bad in (start._replace(scale=0.0), start._replace(offset=-1.1), start._replace(count=1)):
+    for bad in (start._replace(scale=0.0), start._replace(offset=-1.1), start._replace(choices=1)):
         with pytest.raises(InvalidInput, match="actions = "):
             EthBrakeParallelEnv(actions=bad)
 

@@ -56,7 +56,7 @@ def experiment_of(
     kind = algorithm_config_registry[algorithm].get_from_yaml()
     for name, value in more.items():
         setattr(config if hasattr(config, name) else kind, name, value)
-    actions = START._replace(count=ACTIONS if algorithm == "iql" else None)
+    actions = START._replace(choices=ACTIONS if algorithm == "iql" else None)
     line = LineTask(task.name, {"scenario": task, "reward": REWARD, "actions": actions})
     return Experiment(line, kind, models[0], seed, config, models[1])
 
