@@ -4,8 +4,8 @@
 
 IPPO: the critic of a learner has the observation of its actor. MAPPO: the critic has the state of the line. IQL: deep
 Q-learning of each learner with 9 discrete actions. The last batch is a whole one, so 200,000 decisions may be up to
-202,752. What is not the library's default stands in `experiment_of`; the defaults of `ippo`, `mappo` and `iql` are the
-best of their trials (`train/tune.py`). IPPO and MAPPO choose from a normal distribution that ends nowhere.
+202,752. What is not the library's default stands in `experiment_of`; the defaults of `iql` are
+the best of its trials (`train/tune.py`), those of `ippo` and `mappo` the best of the trials of `sb3-ppo`. IPPO and MAPPO choose from a normal distribution that ends nowhere.
 """
 
 from __future__ import annotations
@@ -72,13 +72,25 @@ def train(
 
 
 def ippo(
-    task: eb.Scenario, seed: int, decisions: int, folder: Path, lr: float = 1e-3, passes: int = 10, lmbda: float = 0.9
+    task: eb.Scenario,
+    seed: int,
+    decisions: int,
+    folder: Path,
+    lr: float = 2.78e-3,
+    passes: int = 10,
+    lmbda: float = 0.9,
 ) -> dict[str, Any]:
     return train("ippo", task, seed, decisions, folder, lr, passes, lmbda=lmbda, use_tanh_normal=False)
 
 
 def mappo(
-    task: eb.Scenario, seed: int, decisions: int, folder: Path, lr: float = 1e-3, passes: int = 10, lmbda: float = 0.9
+    task: eb.Scenario,
+    seed: int,
+    decisions: int,
+    folder: Path,
+    lr: float = 2.78e-3,
+    passes: int = 10,
+    lmbda: float = 0.9,
 ) -> dict[str, Any]:
     return train("mappo", task, seed, decisions, folder, lr, passes, lmbda=lmbda, use_tanh_normal=False)
 

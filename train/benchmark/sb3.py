@@ -33,9 +33,9 @@ def ppo(
 
 def sac(
     task: eb.Scenario, seed: int, decisions: int, folder: Path,
-    learning_rate: float = 1e-3, gradient_steps: int = 1, ent_coef: float = 0.05,
+    learning_rate: float = 1e-3, tau: float = 0.005, ent_coef: float = 0.05,
 ) -> dict[str, Any]:  # fmt: skip
-    settings = {"learning_rate": learning_rate, "gradient_steps": gradient_steps, "ent_coef": ent_coef}
+    settings = {"learning_rate": learning_rate, "tau": tau, "ent_coef": ent_coef}
     env = env_of(task, seed)
     model = SAC("MlpPolicy", env, learning_starts=2000, gamma=1.0, seed=seed, device="cpu", **settings)
     return finish(model, decisions, folder)
