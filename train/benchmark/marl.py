@@ -4,8 +4,9 @@
 
 IPPO: the critic of a learner has the observation of its actor. MAPPO: the critic has the state of the line. IQL: deep
 Q-learning of each learner with 9 discrete actions. The last batch is a whole one, so 200,000 decisions may be up to
-202,752. What is not the library's default stands in `experiment_of`; the defaults of `iql` are
-the best of its trials (`train/tune.py`), those of `ippo` and `mappo` the best of the trials of `sb3-ppo`. IPPO and MAPPO choose from a normal distribution that ends nowhere.
+202,752. What is not the library's default stands in `experiment_of`. The defaults of `iql` are the best of its trials
+(`train/tune.py`), those of `ippo` and `mappo` are of the trials of `sb3-ppo`; both choose from a plain normal
+distribution.
 """
 
 from __future__ import annotations
