@@ -61,6 +61,18 @@ def test_measured_gradients__are_those_of_the_return_up_to_their_limit(limit: fl
     assert cut == 0.0 if limit > 1.0 else cut > 0.5
 
 
+def test_simulated_decisions__are_those_of_all_learners_in_all_branches() -> None:
+    model = new_model(VINE, PAIR)
+    act, asked = model.policy.act, []
+    model.policy.act = lambda rows: asked.append(len(rows)) or act(rows)
+    for _ in range(2):
+        asked.clear()
+        results = model.try_out(Visited(model._last_obs, model.rows.episode))
+        assert model.simulated == sum(asked) > 4 * len(results.seen)
+        model.train_actor(results)
+        assert model.logger.name_to_value["train/simulated"] == sum(asked) and model.simulated == 0
+
+
 def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> None:
     policy = train(STILL, "paper-random", tmp_path / "run", measure=None, on_progress=None).policy
     agents = {"old": eb.LearnedAgent(eb.load_shipped("ppo")), "new": eb.LearnedAgent(policy)}
