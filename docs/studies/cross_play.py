@@ -1,6 +1,7 @@
 """Cross-play: the front learner of one team drives with the other learners of another team.
 
-    python docs/studies/cross_play.py benchmark-pair team@runs/benchmark/runs/benchmark-pair-cooperation-seed{0,1,2}
+    python docs/studies/cross_play.py benchmark-pair \\
+        train/benchmark/vine.py:make_agent:runs/benchmark/runs/benchmark-pair-cooperation-seed{0,1,2}
 
 Prints the honest cost as a matrix (row: team of the front learner; column: team of the others), the mean on the
 diagonal, where teams drive as they were trained, and the mean off the diagonal, with bootstrap intervals over teams.

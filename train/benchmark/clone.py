@@ -66,7 +66,8 @@ def clone(
             loss.backward()
             optimiser.step()
     save_file(network.state_dict(), folder / "network.safetensors")
-    searches = len(task.learners) + 1 if len(task.learners) > 1 else 1  # each learner alone, then all together
+    # a search of each learner alone, then one of all together
+    searches = len(task.learners) + (len(task.learners) > 1)
     return {"start": "none", "simulated": decisions * (1 + searches * CANDIDATES)}
 
 

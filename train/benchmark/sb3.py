@@ -26,9 +26,8 @@ def ppo(
     learning_rate: float = 2.78e-3, n_epochs: int = 10, gae_lambda: float = 0.9,
 ) -> dict[str, Any]:  # fmt: skip
     settings = {"learning_rate": learning_rate, "n_epochs": n_epochs, "gae_lambda": gae_lambda}
-    env = env_of(task, seed)
-    model = PPO("MlpPolicy", env, n_steps=64, batch_size=512, gamma=1.0, seed=seed, device="cpu", **settings)
-    return finish(model, decisions, folder)
+    fixed = {"n_steps": 64, "batch_size": 512, "gamma": 1.0, "seed": seed, "device": "cpu"}
+    return finish(PPO("MlpPolicy", env_of(task, seed), **fixed, **settings), decisions, folder)
 
 
 def sac(
@@ -36,9 +35,8 @@ def sac(
     learning_rate: float = 1e-3, tau: float = 0.005, ent_coef: float = 0.05,
 ) -> dict[str, Any]:  # fmt: skip
     settings = {"learning_rate": learning_rate, "tau": tau, "ent_coef": ent_coef}
-    env = env_of(task, seed)
-    model = SAC("MlpPolicy", env, learning_starts=2000, gamma=1.0, seed=seed, device="cpu", **settings)
-    return finish(model, decisions, folder)
+    fixed = {"learning_starts": 2000, "gamma": 1.0, "seed": seed, "device": "cpu"}
+    return finish(SAC("MlpPolicy", env_of(task, seed), **fixed, **settings), decisions, folder)
 
 
 def env_of(task: eb.Scenario, seed: int) -> eb.EthBrakeVecEnv:

@@ -81,14 +81,11 @@ def read_rows(files: Iterable[Path]) -> Cells:
 
 def rate(cells: Cells, task: str) -> None:
     """Shares anew, from the shipped table of best known costs, for rows of the first list of a task."""
-    rows = [row for (at, _), seeds in cells.items() if at == task for row in seeds]
-    episodes = {row.get("episodes") for row in rows}
-    if task in group_of_scenarios(BENCHMARK) and (task, "full_brake") in cells and len(episodes) == 1:
-        scenario, game = eb.open_game(task)
-        worlds = scenario.sample(int(episodes.pop() or EPISODES), SEED)
-        best = float(least_known_values(game, worlds)["honest"].mean())
-        full = float(cells[task, "full_brake"][0]["honest_cost"])
-        for row in rows:
+    if task in group_of_scenarios(BENCHMARK) and (task, "full_brake") in cells:
+        braking, (scenario, game) = cells[task, "full_brake"][0], eb.open_game(task)
+        worlds = scenario.sample(int(braking.get("episodes") or EPISODES), SEED)
+        best, full = float(least_known_values(game, worlds)["honest"].mean()), float(braking["honest_cost"])
+        for row in (row for (at, _), seeds in cells.items() if at == task for row in seeds):
             row["best_known_honest"] = f"{best:.9g}"
             row[SHARE] = repr((full - float(row["honest_cost"])) / (full - best))
 
@@ -190,7 +187,7 @@ def table(cells: Cells) -> list[dict[str, str]]:
                 "method": method + mark_of(cells, task, method),
                 "seeds": f"{len(seeds)}",
                 "decisions": f"{int(decisions):,}" if decisions else "",
-                "simulated": factor_of(cells, task, method),
+                "simulated": f"{factor:,.0f}" if (factor := factor_of(cells, task, method)) else "",
                 "start": seeds[0]["start"],
                 "CPU s": f"{np.mean(spent):.0f}" if spent else "",
                 "share of the possible": PERCENT.show(shares_of(cells, task, method)).in_words,
@@ -205,10 +202,10 @@ def table(cells: Cells) -> list[dict[str, str]]:
     return rows
 
 
-def factor_of(cells: Cells, task: str, method: str) -> str:
-    """Simulated decisions for each decision of the budget; empty for rules."""
+def factor_of(cells: Cells, task: str, method: str) -> float:
+    """Simulated decisions for each decision of the budget; 0 for rules."""
     ratios = [int(row["simulated"]) / int(row["decisions"]) for row in cells[task, method] if row["simulated"]]
-    return f"{np.mean(ratios):,.0f}" if ratios else ""
+    return float(np.mean(ratios)) if ratios else 0.0
 
 
 def further(values: Iterable[float]) -> str:
@@ -248,25 +245,24 @@ def overview(cells: Cells) -> list[dict[str, str]]:
     usual = max(tasks, key=lambda task: len(methods_of(cells, task)))
     for method in dict.fromkeys(method for _, method in cells):
         own = [task for task in tasks if (task, method) in cells]
-        factors = [int(factor.replace(",", "")) for task in own if (factor := factor_of(cells, task, method))]
-        factor = f"{min(factors):,} to {max(factors):,}".partition(f" to {min(factors):,}")[0] if factors else DASH
+        factor = float(np.mean([factor_of(cells, task, method) for task in own]))
         shares = {task: shares_of(cells, task, method) for task in own}
         texts = {task: PERCENT.show(shares[task]).in_words + mark_of(cells, task, method) for task in own}
-        group = 2 if not factors else int(max(factors) > 1)
-        best = shares.get(usual, Estimate(-1.0, None)).value
-        rows.append((group, -best, {"method": method, "simulated": factor} | dict.fromkeys(tasks, DASH) | texts))
+        group, best = int(factor > 1.01) if factor else 2, shares.get(usual, Estimate(-1.0, None)).value
+        first = {"method": method, "simulated": f"{factor:,.0f}" if factor else DASH}
+        rows.append((group, -best, first | dict.fromkeys(tasks, DASH) | texts))
     full = {task: cells[task, "full_brake"][0]["honest_cost"] for task in tasks if (task, "full_brake") in cells}
     costs = {task: f"{float(full[task]):.2f}" if task in full else DASH for task in tasks}
-    best_costs = {task: best_known(cells, task) for task in tasks}
     return [row for _, _, row in sorted(rows, key=lambda row: row[:2])] + [
         {"method": "full braking, honest cost", "simulated": ""} | costs,
-        {"method": "best known, honest cost", "simulated": ""} | best_costs,
+        {"method": "best known, honest cost", "simulated": ""} | {task: best_known(cells, task) for task in tasks},
     ]
 
 
 def differences(cells: Cells) -> list[dict[str, str]]:
     """Difference in honest cost between two cells, with its bootstrap interval over the seeds of both."""
-    pairs = [((task, "mappo"), (task, "ippo")) for task in tasks_of(cells)]
+    compared = ("sb3-ppo", "cooperation"), ("mappo", "ippo")
+    pairs = [((task, one), (task, other)) for one, other in compared for task in tasks_of(cells)]
     pairs += [
         (("benchmark-blocked", method), ("benchmark-pair", method)) for method in methods_of(cells, "benchmark-pair")
     ]
@@ -295,8 +291,8 @@ def held_out(cells: Cells, files: Iterable[Path]) -> list[dict[str, str]]:
             tasks = [task for task, name in others if name == method]
             saved = [np.mean([saving(lists, task, method) for task in tasks]) for lists in (cells, others)]
             first, second = (PERCENT.show(Estimate(float(value), None)).value for value in saved)
-            seed = others[tasks[0], method][0]["list_seed"]
-            rows.append({"method": method, "saved, first list": first, "held-out list": second, "its seed": seed})
+            about = {"method": method, "saved, first list": first, "held-out list": second}
+            rows.append(about | {"its seed": others[tasks[0], method][0]["list_seed"]})
     return rows
 
 
