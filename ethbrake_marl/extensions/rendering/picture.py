@@ -1,11 +1,13 @@
-"""A scene as a picture, drawn with Pillow, whose font is the same on every computer."""
+"""A scene as a picture: pixels, drawn with Pillow, whose font is the same on every computer; or SVG, for slides."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from html import escape
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ethbrake_marl.errors import plain_text
 from ethbrake_marl.extensions.rendering.scene import BODY_M, Impact, Scene
-from ethbrake_marl.motion.layout import GAP, HIT, SPEED
+from ethbrake_marl.motion.layout import GAP, HIT, MASS, SPEED
 
 Frame = NDArray[np.uint8]  # [HEIGHT, WIDTH, 3]
 
@@ -23,6 +25,8 @@ MARGIN = 12
 ROAD_TOP, ROAD_BOTTOM = 84, 138
 LANE = (ROAD_TOP + ROAD_BOTTOM) // 2
 BODY = 13  # half of a body's height
+TRUCK_T = 12.0  # a vehicle of this mass is drawn as a truck: the EU's category N3
+IMPACT_TOP, IMPACT_BOTTOM = 26, 45  # between the title and the higher row of gaps
 PANEL_TOP = 172
 SPACINGS_M = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)  # between written distances, of which at most twelve are in view
 
@@ -51,13 +55,11 @@ def fitting(choices: Sequence[str], width: float, size: int) -> str:
     return next((words for words in choices if text_width(words, size) <= width), choices[-1])
 
 
-class Pen:
+class Pen(ABC):
     """Draws one scene. Coordinates are in pixels of the finished picture; places on the road are in m."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.fronts_m, (self.left_m, self.right_m) = scene, scene.fronts_m, scene.shown_m
-        self.image = Image.new("RGB", (WIDTH * FINE, HEIGHT * FINE), PAPER)
-        self.draw = ImageDraw.Draw(self.image)
 
     def x(self, place_m: float) -> float:
         return (place_m - self.left_m) / (self.right_m - self.left_m) * WIDTH
@@ -70,6 +72,27 @@ class Pen:
     def marks(self, every_m: float) -> list[float]:
         first, last = math.ceil(self.left_m / every_m), math.floor(self.right_m / every_m)
         return [k * every_m for k in range(first, last + 1)]
+
+    @abstractmethod
+    def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
+        """Draw a box with round corners, at least 1 wide and high."""
+
+    @abstractmethod
+    def line(self, x1: float, y1: float, x2: float, y2: float, colour: str, width: float = 1.0) -> None: ...
+
+    @abstractmethod
+    def shape(self, points: Sequence[tuple[float, float]], fill: str, edge: str | None = None) -> None: ...
+
+    @abstractmethod
+    def write(self, x: float, y: float, words: str, colour: str, size: int, anchor: str = "la") -> None:
+        """Write words. ``anchor``: left, middle or right; ascender, middle or baseline (``s``), as in Pillow."""
+
+
+class PixelPen(Pen):
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self.image = Image.new("RGB", (WIDTH * FINE, HEIGHT * FINE), PAPER)
+        self.draw = ImageDraw.Draw(self.image)
 
     def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
         corners = [value * FINE for value in (left, top, max(right, left + 1), max(bottom, top + 1))]
@@ -88,9 +111,51 @@ class Pen:
         return np.array(self.image.reduce(FINE))
 
 
+class VectorPen(Pen):
+    """Pen whose ``elements`` are SVG, without a background."""
+
+    anchors: ClassVar = {"l": "start", "m": "middle", "r": "end"}
+    heights: ClassVar = {"a": 0.8, "m": 0.36, "s": 0.0}  # of the baseline below the anchor, as a share of the size
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self.elements = list[str]()
+
+    def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
+        size = f'width="{max(right - left, 1):.2f}" height="{max(bottom - top, 1):.2f}"'
+        self.elements.append(
+            f'<rect x="{left:.2f}" y="{top:.2f}" {size} rx="2" fill="{fill}" stroke="{edge or "none"}"/>'
+        )
+
+    def line(self, x1: float, y1: float, x2: float, y2: float, colour: str, width: float = 1.0) -> None:
+        way = f"M{x1:.2f} {y1:.2f}L{x2:.2f} {y2:.2f}"
+        self.elements.append(f'<path d="{way}" stroke="{colour}" stroke-width="{width}"/>')
+
+    def shape(self, points: Sequence[tuple[float, float]], fill: str, edge: str | None = None) -> None:
+        places = " ".join(f"{x:.2f},{y:.2f}" for x, y in points)
+        self.elements.append(f'<polygon points="{places}" fill="{fill}" stroke="{edge or "none"}"/>')
+
+    def write(self, x: float, y: float, words: str, colour: str, size: int, anchor: str = "la") -> None:
+        place = f'x="{x:.2f}" y="{y + self.heights[anchor[1]] * size:.2f}" text-anchor="{self.anchors[anchor[0]]}"'
+        self.elements.append(f'<text {place} font-size="{size}" fill="{colour}">{escape(words)}</text>')
+
+
 def picture(scene: Scene) -> Frame:
     """Picture of a scene, [304, 800, 3] uint8."""
-    pen = Pen(scene)
+    pen = PixelPen(scene)
+    draw_scene(pen)
+    return pen.frame()
+
+
+def vector_picture(scene: Scene) -> str:
+    """SVG elements of a picture of a scene."""
+    pen = VectorPen(scene)
+    draw_scene(pen)
+    return "\n".join(pen.elements)
+
+
+def draw_scene(pen: Pen) -> None:
+    scene = pen.scene
     draw_road(pen)
     for body in range(1, len(scene.wanted)):
         draw_vehicle(pen, body)
@@ -102,7 +167,6 @@ def picture(scene: Scene) -> Frame:
     pen.write(MARGIN, 10, fitting(cut, WIDTH - 3 * MARGIN - text_width(scene.clock, 18), 15), GREY, 15)
     pen.write(WIDTH - MARGIN, 8, scene.clock, INK, 18, "ra")
     pen.write(MARGIN, HEIGHT - 22, scene.harm, INK, 15)
-    return pen.frame()
 
 
 def draw_road(pen: Pen) -> None:
@@ -124,7 +188,13 @@ def draw_road(pen: Pen) -> None:
 
 def draw_vehicle(pen: Pen, body: int) -> None:
     left, right = pen.ends(body)
-    pen.box(left, LANE - BODY, right, LANE + BODY, vehicle_colour(body))
+    if pen.scene.car[MASS, body] >= TRUCK_T:  # a trailer, wider than the cab, and the coupling between them
+        cab, trailer = left + (right - left) * 0.7, left + (right - left) * 0.62
+        pen.line(trailer, LANE, cab, LANE, INK, 4.0)
+        pen.box(cab, LANE - BODY + 2, right, LANE + BODY - 2, vehicle_colour(body))
+        pen.box(left, LANE - BODY - 2, trailer, LANE + BODY + 2, vehicle_colour(body))
+    else:
+        pen.box(left, LANE - BODY, right, LANE + BODY, vehicle_colour(body))
     glass = left + (right - left) * 0.72
     pen.box(glass, LANE - BODY + 4, glass + (right - left) * 0.1, LANE + BODY - 4, GLASS)
     if pen.scene.command(body) < 0.0:
@@ -191,5 +261,5 @@ def show_impacts(pen: Pen) -> None:
         half = text_width(words, 15) / 2
         middle = sum(x(impact) for impact in hardest) / len(hardest)
         middle = min(max(middle, MARGIN + half), WIDTH - MARGIN - half)
-        pen.box(middle - half - 5, 34, middle + half + 5, 54, FLASH)
-        pen.write(middle, 44, words, INK, 15, "mm")
+        pen.box(middle - half - 5, IMPACT_TOP, middle + half + 5, IMPACT_BOTTOM, FLASH)
+        pen.write(middle, (IMPACT_TOP + IMPACT_BOTTOM) / 2, words, INK, 15, "mm")
