@@ -35,12 +35,6 @@ def key_table(v2x: V2X | None = None) -> list[list[str]]:
     return rows
 
 
-def page_table() -> str:
-    head, *rows = [[cell.replace("|", r"\|") for cell in row] for row in key_table()]
-    rows = [[f"`{key}`", *cells] for key, *cells in rows]
-    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])
-
-
 def _fields(fields: Mapping[str, FieldInfo], within: str = "") -> Iterator[tuple[str, FieldInfo]]:
     for key, field in fields.items():
         yield within + key, field
