@@ -169,7 +169,8 @@ def write_ablation(plan: Ablation, measured: Sequence[LevelResult], results: Jso
     json_file, csv_file, picture = (plan.folder / name for name in (JSON, CSV, FIGURE))
     write_output(json_file, f"{json.dumps(results, indent=2, allow_nan=False)}\n".encode(), force=True)
     write_output(csv_file, levels_csv(measured, plan.search_episodes).encode(), force=True)
-    write_picture(picture, ablation_figure(results, conditions(plan)), force=True)
+    caption = f"{conditions(plan)} Its line is as far below a bar as in these worlds."
+    write_picture(picture, ablation_figure(results, caption), force=True)
     return [json_file, csv_file, picture]
 
 
