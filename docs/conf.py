@@ -79,6 +79,9 @@ copybutton_only_copy_prompt_lines = True
 
 # Pages that the site makes from other files: README, changelog, a policy's card, help texts, the reproduction.
 
+ROW = re.compile(r"(?m)^\|.*\|$")
+TOGETHER = re.compile(r" (?=%)|(?<=,) (?=[^\[\]|]*\])")  # a number and its unit, both ends of an interval
+
 LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
 
@@ -144,7 +147,8 @@ PAPER_TABLES = {
 def paper_tables() -> str:
     """Main tables of the paper's reproduction, from CSV files."""
     blocks = (
-        f"## {title}\n\n```{{csv-table}}\n:file: {file}\n:header-rows: 1\n```" for title, file in PAPER_TABLES.items()
+        f"## {title}\n\n```{{csv-table}}\n:file: {file}\n:header-rows: 1\n:class: dense\n```"
+        for title, file in PAPER_TABLES.items()
     )
     return "\n\n".join(blocks)
 
@@ -178,7 +182,7 @@ def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
         if docname in WORDS
         else ""
     )
-    source[0] = words + text
+    source[0] = words + ROW.sub(lambda row: TOGETHER.sub("\u00a0", row[0]), text)
 
 
 def tidy(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
