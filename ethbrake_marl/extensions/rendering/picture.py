@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cache
 from html import escape
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +25,12 @@ ROAD_TOP, ROAD_BOTTOM = 84, 138
 LANE = (ROAD_TOP + ROAD_BOTTOM) // 2
 BODY = 13  # half of a body's height
 TRUCK_T = 12.0  # a vehicle of this mass is drawn as a truck: the EU's category N3
-IMPACT_TOP, IMPACT_BOTTOM = 26, 45  # between the title and the higher row of gaps
 PANEL_TOP = 172
 SPACINGS_M = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)  # between written distances, of which at most twelve are in view
+
+SVG_ANCHORS = {  # of Pillow -> of SVG, and way down to the baseline as a share of the size
+    "la": ("start", 0.8), "ra": ("end", 0.8), "ma": ("middle", 0.8), "mm": ("middle", 0.36), "ms": ("middle", 0.0),
+}  # fmt: skip
 
 PAPER, INK, GREY, PALE = "#ffffff", "#1a1a1a", "#6b6b6b", "#eeeeee"
 ASPHALT, DASH, GLASS = "#4a4d52", "#e8e8e8", "#dfefff"
@@ -55,11 +57,13 @@ def fitting(choices: Sequence[str], width: float, size: int) -> str:
     return next((words for words in choices if text_width(words, size) <= width), choices[-1])
 
 
-class Pen(ABC):
+class Pen:
     """Draws one scene. Coordinates are in pixels of the finished picture; places on the road are in m."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.fronts_m, (self.left_m, self.right_m) = scene, scene.fronts_m, scene.shown_m
+        self.image = Image.new("RGB", (WIDTH * FINE, HEIGHT * FINE), PAPER)
+        self.draw = ImageDraw.Draw(self.image)
 
     def x(self, place_m: float) -> float:
         return (place_m - self.left_m) / (self.right_m - self.left_m) * WIDTH
@@ -72,27 +76,6 @@ class Pen(ABC):
     def marks(self, every_m: float) -> list[float]:
         first, last = math.ceil(self.left_m / every_m), math.floor(self.right_m / every_m)
         return [k * every_m for k in range(first, last + 1)]
-
-    @abstractmethod
-    def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
-        """Draw a box with round corners, at least 1 wide and high."""
-
-    @abstractmethod
-    def line(self, x1: float, y1: float, x2: float, y2: float, colour: str, width: float = 1.0) -> None: ...
-
-    @abstractmethod
-    def shape(self, points: Sequence[tuple[float, float]], fill: str, edge: str | None = None) -> None: ...
-
-    @abstractmethod
-    def write(self, x: float, y: float, words: str, colour: str, size: int, anchor: str = "la") -> None:
-        """Write words. ``anchor``: left, middle or right; ascender, middle or baseline (``s``), as in Pillow."""
-
-
-class PixelPen(Pen):
-    def __init__(self, scene: Scene) -> None:
-        super().__init__(scene)
-        self.image = Image.new("RGB", (WIDTH * FINE, HEIGHT * FINE), PAPER)
-        self.draw = ImageDraw.Draw(self.image)
 
     def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
         corners = [value * FINE for value in (left, top, max(right, left + 1), max(bottom, top + 1))]
@@ -112,10 +95,7 @@ class PixelPen(Pen):
 
 
 class VectorPen(Pen):
-    """Pen whose ``elements`` are SVG, without a background."""
-
-    anchors: ClassVar = {"l": "start", "m": "middle", "r": "end"}
-    heights: ClassVar = {"a": 0.8, "m": 0.36, "s": 0.0}  # of the baseline below the anchor, as a share of the size
+    """Pen whose ``elements`` are SVG, without a background. Text is as wide as in the reader's font."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
@@ -136,13 +116,14 @@ class VectorPen(Pen):
         self.elements.append(f'<polygon points="{places}" fill="{fill}" stroke="{edge or "none"}"/>')
 
     def write(self, x: float, y: float, words: str, colour: str, size: int, anchor: str = "la") -> None:
-        place = f'x="{x:.2f}" y="{y + self.heights[anchor[1]] * size:.2f}" text-anchor="{self.anchors[anchor[0]]}"'
+        across, down = SVG_ANCHORS[anchor]
+        place = f'x="{x:.2f}" y="{y + down * size:.2f}" text-anchor="{across}"'
         self.elements.append(f'<text {place} font-size="{size}" fill="{colour}">{escape(words)}</text>')
 
 
 def picture(scene: Scene) -> Frame:
     """Picture of a scene, [304, 800, 3] uint8."""
-    pen = PixelPen(scene)
+    pen = Pen(scene)
     draw_scene(pen)
     return pen.frame()
 
@@ -261,5 +242,5 @@ def show_impacts(pen: Pen) -> None:
         half = text_width(words, 15) / 2
         middle = sum(x(impact) for impact in hardest) / len(hardest)
         middle = min(max(middle, MARGIN + half), WIDTH - MARGIN - half)
-        pen.box(middle - half - 5, IMPACT_TOP, middle + half + 5, IMPACT_BOTTOM, FLASH)
-        pen.write(middle, (IMPACT_TOP + IMPACT_BOTTOM) / 2, words, INK, 15, "mm")
+        pen.box(middle - half - 5, 26, middle + half + 5, 45, FLASH)  # between the title and the higher row of gaps
+        pen.write(middle, 35.5, words, INK, 15, "mm")
