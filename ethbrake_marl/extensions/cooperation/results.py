@@ -169,8 +169,8 @@ def write_ablation(plan: Ablation, measured: Sequence[LevelResult], results: Jso
     json_file, csv_file, picture = (plan.folder / name for name in (JSON, CSV, FIGURE))
     write_output(json_file, f"{json.dumps(results, indent=2, allow_nan=False)}\n".encode(), force=True)
     write_output(csv_file, levels_csv(measured, plan.search_episodes).encode(), force=True)
-    caption = f"{conditions(plan)} Its line is as far below a bar as in these worlds."
-    write_picture(picture, ablation_figure(results, caption), force=True)
+    figure = ablation_figure(results, f"{conditions(plan)} Its line is as far below a bar as in these worlds.")
+    write_picture(picture, figure, force=True)
     return [json_file, csv_file, picture]
 
 
@@ -311,6 +311,5 @@ def _draw_bounds(axes: Axes, points: list[tuple[float, Json]], half: float) -> N
         if entry["searched"]["best_known"] is not None
     ]
     for label, colour, lines in (("full braking", GREY, braking), ("joint optimum", series_style(3)["color"], optimum)):
-        for number, (x, value) in enumerate(lines):
-            name = "" if number else label
-            axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=name)
+        x, value = np.transpose(lines)
+        axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=label)

@@ -138,8 +138,10 @@ def write_svg(films: Films) -> bytes:
         f'<svg y="{k * ROAD}" width="{WIDTH}" height="{ROAD}">\n{vector_picture(scene)}\n</svg>'
         for k, scene in enumerate(moments(films))
     ]
-    size = f'width="{WIDTH}" height="{len(rows) * ROAD}" viewBox="0 0 {WIDTH} {len(rows) * ROAD}"'
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="Arial, Helvetica, sans-serif">'
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{len(rows) * ROAD}"'
+        f' viewBox="0 0 {WIDTH} {len(rows) * ROAD}" font-family="Arial, Helvetica, sans-serif">'
+    )
     return "\n".join([head, *rows, "</svg>\n"]).encode()
 
 

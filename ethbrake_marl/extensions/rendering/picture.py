@@ -102,14 +102,15 @@ class VectorPen(Pen):
         self.elements = list[str]()
 
     def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
-        size = f'width="{max(right - left, 1):.2f}" height="{max(bottom - top, 1):.2f}"'
         self.elements.append(
-            f'<rect x="{left:.2f}" y="{top:.2f}" {size} rx="2" fill="{fill}" stroke="{edge or "none"}"/>'
+            f'<rect x="{left:.2f}" y="{top:.2f}" width="{max(right - left, 1):.2f}" height="{max(bottom - top, 1):.2f}"'
+            f' rx="2" fill="{fill}" stroke="{edge or "none"}"/>'
         )
 
     def line(self, x1: float, y1: float, x2: float, y2: float, colour: str, width: float = 1.0) -> None:
-        way = f"M{x1:.2f} {y1:.2f}L{x2:.2f} {y2:.2f}"
-        self.elements.append(f'<path d="{way}" stroke="{colour}" stroke-width="{width}"/>')
+        self.elements.append(
+            f'<path d="M{x1:.2f} {y1:.2f}L{x2:.2f} {y2:.2f}" stroke="{colour}" stroke-width="{width}"/>'
+        )
 
     def shape(self, points: Sequence[tuple[float, float]], fill: str, edge: str | None = None) -> None:
         places = " ".join(f"{x:.2f},{y:.2f}" for x, y in points)
@@ -117,8 +118,10 @@ class VectorPen(Pen):
 
     def write(self, x: float, y: float, words: str, colour: str, size: int, anchor: str = "la") -> None:
         across, down = SVG_ANCHORS[anchor]
-        place = f'x="{x:.2f}" y="{y + down * size:.2f}" text-anchor="{across}"'
-        self.elements.append(f'<text {place} font-size="{size}" fill="{colour}">{escape(words)}</text>')
+        self.elements.append(
+            f'<text x="{x:.2f}" y="{y + down * size:.2f}" text-anchor="{across}" font-size="{size}" fill="{colour}">'
+            f"{escape(words)}</text>"
+        )
 
 
 def picture(scene: Scene) -> Frame:
