@@ -168,10 +168,12 @@ def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Complete the pages that are made, add words of the search, and lead links that leave docs/ to their page."""
     text = relink(source[0], docname, (DOCS / docname).parent)
     if docname == "index":
+        app.env.note_dependency(str(ROOT / "README.md"))
         text = first_page()
     elif docname == "reference/cli":
         text += "\n" + commands()
     elif docname == "decisions/README":
+        app.env.note_dependency(str(ROOT / "CHANGELOG.md"))
         text += "\n" + changes()
     elif docname == "paper-results":
         text += "\n" + paper_tables()
