@@ -119,7 +119,7 @@ class ReportKeys(ScenarioPart):
 class Reports(ChannelKey):
     """Errors in what vehicles report and measure of each other (key ``reports`` of ``v2x``).
 
-    The errors are noise of speeds and places, bias of speeds, and one vehicle that lies about its acceleration and intent.
+    The errors are noise of speeds and places, bias of speeds, and a vehicle that lies about acceleration and intent.
     """
 
     name, keys = NAME, ReportKeys
