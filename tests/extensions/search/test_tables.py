@@ -32,7 +32,7 @@ MEANS = {  # harm of docs/least-harm.md, m2/s2: first-impact, total
 }  # fmt: skip
 
 COSTS = {  # honest cost of docs/results/benchmark.md, m2/s2
-    "benchmark-all": 0.299, "benchmark-blocked": 36.837, "benchmark-five": 0.436, "benchmark-noisy": 19.252,
+    "benchmark-all": 0.286, "benchmark-blocked": 36.837, "benchmark-five": 0.386, "benchmark-noisy": 19.252,
     "benchmark-pair": 14.211, "benchmark-truck": 16.483,
 }  # fmt: skip
 
