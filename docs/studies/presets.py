@@ -1,4 +1,4 @@
-"""Delays of the news with each preset of `v2x`, for docs/cooperation.md.
+"""All keys of `v2x`, and delays of the news with each preset, for docs/cooperation.md.
 
 .venv/bin/python docs/studies/presets.py
 """
@@ -11,8 +11,10 @@ import numpy as np
 
 from ethbrake_marl import load_scenario
 from ethbrake_marl.worlds.channel import PRESETS
+from ethbrake_marl.worlds.channel_table import page_table
 
 argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+print(page_table(), end="\n\n")
 base = load_scenario("cooperation-2-paper")
 for preset in [*PRESETS][1:]:
     worlds = base.replace(v2x=preset, latency_s=0).sample(100_000, seed=7)

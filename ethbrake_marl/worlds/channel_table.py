@@ -11,7 +11,7 @@ from ethbrake_marl.files.model import models_in
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.worlds.channel import PRESETS, V2X
 
-UNITS = {"s": "s", "mps": "m/s"}  # suffix of a key -> its unit
+UNITS = {"s": "s", "m": "m", "mps": "m/s"}  # suffix of a key -> its unit
 NO_VALUE = "–"  # the key has no effect with this preset, or no value
 
 
@@ -33,6 +33,12 @@ def key_table(v2x: V2X | None = None) -> list[list[str]]:
         unit = UNITS.get(key.rsplit("_", 1)[-1], "1" if field.annotation is float else NO_VALUE)
         rows.append([key, unit, *cells, str(field.description)])
     return rows
+
+
+def page_table() -> str:
+    head, *rows = [[cell.replace("|", r"\|") for cell in row] for row in key_table()]
+    rows = [[f"`{key}`", *cells] for key, *cells in rows]
+    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])
 
 
 def _fields(fields: Mapping[str, FieldInfo], within: str = "") -> Iterator[tuple[str, FieldInfo]]:

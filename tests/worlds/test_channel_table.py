@@ -1,4 +1,4 @@
-"""The table of all keys of ``v2x``, in ``scenario show``."""
+"""The table of all keys of ``v2x``: on its page, and in ``scenario show``."""
 
 import numpy as np
 import pytest
@@ -8,10 +8,15 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import parse_yaml
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.channel import PER_LINK, PRESETS, V2X
-from ethbrake_marl.worlds.channel_table import key_table, values_of
+from ethbrake_marl.worlds.channel_table import key_table, page_table, values_of
 from ethbrake_marl.worlds.scenario_file import whole_text
+from tests.docs.site import DOCS
 
 BUILT_IN = [name for name, settings in PRESETS.items() if "preset" not in settings]
+
+
+def test_page__has_the_table_of_the_code() -> None:
+    assert page_table() in (DOCS / "cooperation.md").read_text("utf-8")
 
 
 def test_table__has_every_key_and_every_preset() -> None:
