@@ -132,7 +132,7 @@ def test_unavoidable__is_one_share_of_the_worlds() -> None:
     share = r"(\d+\.\d) ?%"
     said = re.compile(rf"{share}[^.|%]{{0,80}}(?:unavoidable|no command)|unavoidable\W[^.|%]{{0,60}}?{share}")
     values = {(name, *filter(None, each.groups())) for name, text in prose() for each in said.finditer(text)}
-    assert len(values) > 4
+    assert len(values) > 3
     assert [each for each in values if each[1] != "65.1"] == []
 
 
