@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Iterable
@@ -76,7 +77,10 @@ html_show_sourcelink = False
 copybutton_prompt_text = "$ "
 copybutton_only_copy_prompt_lines = True
 
-# Pages that the site makes from other files: README, changelog, cards of policies, help texts, the reproduction.
+# Pages that the site makes from other files: README, changelog, a policy's card, help texts, the reproduction.
+
+ROW = re.compile(r"(?m)^\|.*\|$")
+TOGETHER = re.compile(r" (?=%)|(?<=,) (?=[^\[\]|]*\])")  # a number and its unit, both ends of an interval
 
 LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
@@ -89,7 +93,7 @@ def relink(text: str, docname: str, folder: Path) -> str:
         if not path.exists():  # code that looks like a link
             return found[0]
         if path.name == "card.md":
-            path, anchor = DOCS / "reference" / "policies.md", f"#{path.parent.name}"
+            path = DOCS / "reference" / "policies.md"
         pages = {ROOT / "README.md": "index.md", ROOT / "CHANGELOG.md": "decisions/README.md"}
         return f"]({os.path.relpath(DOCS / pages.get(path, path), (DOCS / docname).parent)}{anchor})"
 
@@ -127,18 +131,26 @@ def commands() -> str:
     return re.sub(options, lambda found: f"`{found[1]}`" if found[1] else found[0], text)
 
 
-def cards() -> str:
-    """Card of every shipped policy, its headings one level lower."""
-    paths = sorted((ROOT / "ethbrake_marl" / "shipped" / "policies").glob("*/card.md"))
-    texts = [relink(path.read_text("utf-8"), "reference/policies", path.parent) for path in paths]
-    return "\n\n".join(re.sub(r"(?m)^#(?=#* )", "##", text) for text in texts)
+def card() -> str:
+    """Card of the shipped policy ``ppo``, its headings one level lower."""
+    path = ROOT / "ethbrake_marl" / "shipped" / "policies" / "ppo" / "card.md"
+    return re.sub(r"(?m)^#(?=#* )", "##", relink(path.read_text("utf-8"), "reference/policies", path.parent))
 
 
-def reproduction() -> str:
+PAPER_TABLES = {
+    "Results": "results/reproduction/claims.csv",
+    "Open quantities": "studies/paper/open-quantities.csv",
+    "Equations that differ": "studies/paper/equations.csv",
+}
+
+
+def paper_tables() -> str:
     """Main tables of the paper's reproduction, from CSV files."""
-    files = ("results/reproduction/claims.csv", "studies/paper/open-quantities.csv")
-    blocks = (f"```{{csv-table}}\n:file: {file}\n:header-rows: 1\n```" for file in files)
-    return "## Tables\n\n" + "\n\n".join(blocks)
+    blocks = (
+        f"## {title}\n\n```{{csv-table}}\n:file: {file}\n:header-rows: 1\n:class: dense\n```"
+        for title, file in PAPER_TABLES.items()
+    )
+    return "\n\n".join(blocks)
 
 
 def changes() -> str:
@@ -147,20 +159,32 @@ def changes() -> str:
     return re.sub(r"(?m)^#(?=#* )", "##", text)
 
 
+WORDS = json.loads(
+    re.findall(r"const WORDS = (\{.*?\});", (DOCS / "static" / "search.js").read_text("utf-8"), re.DOTALL)[0]
+)
+
+
 def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Complete the pages that are made, and lead links that leave docs/ to their page on the site."""
+    """Complete the pages that are made, add words of the search, and lead links that leave docs/ to their page."""
     text = relink(source[0], docname, (DOCS / docname).parent)
     if docname == "index":
+        app.env.note_dependency(str(ROOT / "README.md"))
         text = first_page()
     elif docname == "reference/cli":
         text += "\n" + commands()
     elif docname == "decisions/README":
+        app.env.note_dependency(str(ROOT / "CHANGELOG.md"))
         text += "\n" + changes()
-    elif docname == "paper":
-        text += "\n" + reproduction()
+    elif docname == "paper-results":
+        text += "\n" + paper_tables()
     elif docname == "reference/policies":
-        text += "\n" + cards()
-    source[0] = text
+        text += "\n" + card()
+    words = (
+        f"---\nmyst:\n  html_meta:\n    keywords: {', '.join(WORDS[docname].split())}\n---\n"
+        if docname in WORDS
+        else ""
+    )
+    source[0] = words + ROW.sub(lambda row: TOGETHER.sub("\u00a0", row[0]), text)
 
 
 def tidy(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:

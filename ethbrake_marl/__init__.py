@@ -100,7 +100,7 @@ if TYPE_CHECKING:
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError, MissingExtra as MissingExtra
 
-__version__ = "3.0.0.dev0"
+__version__ = "3.0.0"
 
 
 _HOMES = names_behind(__file__)

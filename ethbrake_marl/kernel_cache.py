@@ -15,7 +15,6 @@ import sys
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -27,6 +26,7 @@ SUFFIX = ".compiled"
 UNSTORED = "every process compiles the physics again; set NUMBA_CACHE_DIR to a folder that you alone can write"
 _DIGEST_BYTES = 32
 _warned: list[str] = []
+_announced: list[str] = []
 
 
 def cache_folder() -> Path | None:
@@ -89,10 +89,13 @@ def delete_damaged() -> tuple[int, int]:
     return len(damaged), sum(not _delete(path) for path in damaged)
 
 
-@cache
-def announce_compilation() -> None:
-    """Print a line on stderr, once in this process, just before it first compiles."""
-    what = "parts of the physics" if _stored_files() else "the physics for the first time, which takes a minute or more"
+def announce_compilation(module: str) -> None:
+    """Print a line on stderr, once in this process, just before it first compiles; ``module``: a function's place."""
+    if _announced:
+        return
+    _announced.append(module)
+    parts = f"parts of the physics that no earlier command needed, first of {module}"
+    what = parts if _stored_files() else "the physics for the first time, which takes a minute or more"
     advice = "" if obstacle() else "; later processes use the stored result"
     with suppress(AttributeError, OSError, ValueError):  # there is no stderr
         sys.stderr.write(f"compiling {what}{advice}\n")

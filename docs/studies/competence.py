@@ -9,8 +9,8 @@
 no line is a shipped scenario. ``warning`` judges the chosen rule in the shipped scenarios. Both are for a policy of the
 recipe ``three-tests`` only, which is bad in many lines. ``table`` writes docs/results/lines.csv, which compares agents
 in every shipped scenario, in lines of 2 to 8 vehicles with each position as the learner, and in 39 others, and prints
-the table of docs/findings.md. ``search`` adds the best known costs of lines that competence.json lacks. All costs are
-honest costs, means of ``WORLDS`` worlds.
+the table of docs/findings.md. ``search`` searches the best known costs in competence.json again. All costs are honest
+costs, means of ``WORLDS`` worlds.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from ethbrake_marl.agent_names import make_teams, open_game
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.evaluation.summary import OUTSIDE_SHARE
 from ethbrake_marl.extensions.search.best_harm import search_list
+from ethbrake_marl.extensions.search.pricing import problem_of
+from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.policies import training_range
 from ethbrake_marl.policies.bundle import load_named_policy
 
@@ -150,18 +152,24 @@ def every_line() -> dict[str, eb.Scenario]:
 
 
 def search() -> None:
-    """Search the least cost of the lines that ``BEST`` lacks, starting also from the agents' commands."""
-    known = json.loads(BEST.read_text())
+    """Search the best known costs again, starting also from the agents' commands. The less of old and new cost stays.
+
+    Lines whose worlds and learners are the same have one cost.
+    """
+    known, tables = json.loads(BEST.read_text()), dict[bytes, BestHarmTable]()
+    alike: dict[bytes, list[str]] = {}
     for name, scenario in every_line().items():
-        if name not in known:
-            game = open_game(scenario)[1]
-            teams = make_teams(",".join((*RIVALS, AGENT)), scenario, harm_count="honest").values()
-            found = search_list(
-                game, scenario.sample(WORLDS, SEED), harm_counts=("honest",), budget=BUDGET, teams=teams, threads=1
-            )
-            known[name] = float(found.harm["honest"].mean())
-            BEST.write_text(json.dumps(known, indent=1) + "\n")
-            print(name, known[name], flush=True)
+        game, worlds = open_game(scenario)[1], scenario.sample(WORLDS, SEED)
+        key = problem_of(game, worlds).identity.tobytes()
+        tables[key] = search_list(
+            game, worlds, harm_counts=("honest",), budget=BUDGET, threads=1, known_table=tables.get(key),
+            teams=make_teams(",".join((*RIVALS, AGENT)), scenario, harm_count="honest").values(),
+        )  # fmt: skip
+        alike.setdefault(key, []).append(name)
+        cost = min([float(tables[key].harm["honest"].mean()), *(known[each] for each in alike[key] if each in known)])
+        print(name, known.get(name), cost, flush=True)
+        known |= dict.fromkeys(alike[key], cost)
+        BEST.write_text(json.dumps(known, indent=1) + "\n")
 
 
 def row_of(scenario: eb.Scenario, least: float) -> dict[str, Any]:

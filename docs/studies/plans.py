@@ -2,15 +2,18 @@
 
     python docs/studies/plans.py
     python docs/studies/plans.py --policy runs/on-top
+    python docs/studies/plans.py --time
 
 Prints mean honest costs, and paired differences with 95 % intervals over worlds. A joint plan is one for all learners,
-of which each learner applies its own part. ``--policy`` compares a trained policy, too.
+of which each learner applies its own part. ``--policy`` compares a trained policy, too. ``--time`` prints the processor
+time of a decision instead.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
+import time
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +36,8 @@ SEVERAL = (
 HIDDEN = ("cooperation-1-front", "cooperation-2-blocked", "benchmark-noisy", "benchmark-blocked")
 PIECES = ("place", "speed", "acceleration", "braking_capacity", "latency", "mass")
 WORLDS, SEED = 300, 111
+CANDIDATES = (20, 50, 150, 500)
+BATCHES = {1: 40, 200: 200}  # worlds together -> worlds in which decisions are timed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +57,31 @@ class JointPlanner(Planner):
             candidates=self.candidates,
         )  # fmt: skip
         return plans[:, COMMANDS.start, body].copy(), plans
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimedPlanner(Planner):
+    """Notes the processor time of a decision, mean over worlds (s)."""
+
+    spent_s: list[float] = field(default_factory=list)
+
+    def act(self, state: eb.State, memory: Any, body: int) -> tuple[Any, Any]:
+        begin = time.process_time()
+        acted = super().act(state, memory, body)
+        self.spent_s.append((time.process_time() - begin) / state.n)
+        return acted
+
+
+def time_of_decisions() -> None:
+    scenario, game = eb.open_game("paper-random")
+    for candidates in CANDIDATES:
+        for together, number in BATCHES.items():
+            planner = TimedPlanner(time_step_s=scenario.time_step_s, candidates=candidates)
+            worlds = scenario.sample(number, SEED)
+            for first in range(0, number, together):
+                play_to_end(game, worlds.take(slice(first, first + together)), Team("plan", {2: planner}))
+            mean, median = (1e6 * function(planner.spent_s) for function in (np.mean, np.median))
+            print(f"{candidates} candidates, {together} worlds together: mean {mean:.0f} us, median {median:.0f} us")
 
 
 def costs(scenario: eb.Scenario, worlds: eb.State, agent: Any) -> np.ndarray:
@@ -123,7 +153,11 @@ def hidden_values() -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policy", help="run of a network on top of the plan")
+    parser.add_argument("--time", action="store_true", help="print the processor time of a decision instead")
     given = parser.parse_args()
+    if given.time:
+        time_of_decisions()
+        parser.exit()
     try:
         one_learner(given.policy)
         several_learners()

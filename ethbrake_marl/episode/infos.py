@@ -9,6 +9,7 @@ first_impact_harm         harm that the vehicle has borne so far, first impact o
 total_harm                harm that the vehicle has borne so far, all impacts, m2/s2
 world_first_impact_harm   harm of the whole line so far, first impact of each pair, m2/s2
 world_total_harm          harm of the whole line so far, all impacts, m2/s2
+world_honest_cost         honest cost of the whole line so far, m2/s2; NaN under a physics of one's own
 collided                  whether the world has had an impact
 cut                       whether the episode was truncated before the horizon; later harm and motion then cost nothing
 cost                      harm of the line in the last step, in the reward's count, m2/s2
@@ -26,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.episode.commands import action_of
-from ethbrake_marl.episode.counts import ALL_IMPACTS, FIRST_IMPACTS, amount_so_far
+from ethbrake_marl.episode.counts import ALL_IMPACTS, FIRST_IMPACTS, HONEST, amount_so_far
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import ENDED, FIRST_IN_LIST, HORIZON, NUMBER, TIME, State, split_world
 from ethbrake_marl.episode.step import Step, stands
@@ -35,11 +36,11 @@ from ethbrake_marl.motion.layout import FIRST, FORCE, IMPACTS, MASS, TOTAL, Floa
 
 # rows of `out`
 (
-    TIME_NOW, FORCE_NOW, BORNE_FIRST, BORNE_TOTAL, LINE_FIRST, LINE_TOTAL, COLLIDED, COMMAND, ACTION, CUT, LISTED,
-    WORLD,
-) = range(12)  # fmt: skip
-OUT_ROWS = 12
-FIRST_WEIGHTS, TOTAL_WEIGHTS = FIRST_IMPACTS.weight_array, ALL_IMPACTS.weight_array
+    TIME_NOW, FORCE_NOW, BORNE_FIRST, BORNE_TOTAL, LINE_FIRST, LINE_TOTAL, LINE_HONEST, COLLIDED, COMMAND, ACTION, CUT,
+    LISTED, WORLD,
+) = range(13)  # fmt: skip
+OUT_ROWS = 13
+FIRST_WEIGHTS, TOTAL_WEIGHTS, HONEST_WEIGHTS = FIRST_IMPACTS.weight_array, ALL_IMPACTS.weight_array, HONEST.weight_array
 
 
 @large
@@ -52,6 +53,7 @@ def report(line, car, clock, wanted, bodies, borne, out):
         split_world(line[k, FIRST], car[k, MASS], borne[0])
         split_world(line[k, TOTAL], car[k, MASS], borne[1])
         first, total = amount_so_far(line[k], FIRST_WEIGHTS), amount_so_far(line[k], TOTAL_WEIGHTS)
+        honest = amount_so_far(line[k], HONEST_WEIGHTS)
         impacts, number = 0.0, clock[k, NUMBER]
         listed = number <= FIRST_IN_LIST
         cut = clock[k, ENDED] == 1.0 and clock[k, TIME] < clock[k, HORIZON] and not stands(line[k], wanted[k])
@@ -62,7 +64,7 @@ def report(line, car, clock, wanted, bodies, borne, out):
             info, time, command = out[:, k, o], clock[k, TIME], wanted[k, i]
             info[TIME_NOW], info[FORCE_NOW], info[COLLIDED] = time, line[k, FORCE, i], 1.0 if impacts > 0.0 else 0.0
             info[BORNE_FIRST], info[BORNE_TOTAL] = borne[0, i - 1], borne[1, i - 1]
-            info[LINE_FIRST], info[LINE_TOTAL] = first, total
+            info[LINE_FIRST], info[LINE_TOTAL], info[LINE_HONEST] = first, total, honest
             info[COMMAND], info[ACTION], info[CUT] = command, action_of(car[k], i, command), 1.0 if cut else 0.0
             info[WORLD], info[LISTED] = FIRST_IN_LIST - number if listed else number, 1.0 if listed else 0.0
 
@@ -71,6 +73,8 @@ def numbers(state: State, bodies: Ints) -> Floats:
     """Infos of the B ``bodies`` that follow from the state, [OUT_ROWS, n, B]."""
     out = np.empty((OUT_ROWS, state.n, len(bodies)))
     report(state.line, state.car, state.clock, state.wanted, bodies, np.empty((2, state.vehicles)), out)
+    if not state.defines(HONEST):
+        out[LINE_HONEST] = np.nan
     return out
 
 
@@ -79,7 +83,8 @@ def named(values: Any, world: Any, cost: Any, seed: Any) -> dict[str, Any]:
 
     ``values``: the rows of ``numbers`` before the last one, ``WORLD``. ``world``: number of the world, a whole number.
     """
-    time, force, borne_first, borne_total, line_first, line_total, collided, command, action, cut, listed = values
+    time, force, borne_first, borne_total, *line, collided, command, action, cut, listed = values
+    line_first, line_total, line_honest = line
     return {
         "time_s": time,
         "command_in_force_mps2": force,
@@ -87,6 +92,7 @@ def named(values: Any, world: Any, cost: Any, seed: Any) -> dict[str, Any]:
         "total_harm": borne_total,
         "world_first_impact_harm": line_first,
         "world_total_harm": line_total,
+        "world_honest_cost": line_honest,
         "collided": collided == 1.0,
         "chosen_command_mps2": command,
         "chosen_action": action,

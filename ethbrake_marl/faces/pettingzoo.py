@@ -78,7 +78,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     >>> observations, infos = env.reset(seed=7)
     >>> while env.agents:
     ...     observations, rewards, terminations, truncations, infos = env.step({"vehicle_2": [-1.0]})
-    >>> terminations["vehicle_2"], round(infos["vehicle_2"]["world_total_harm"], 2)
+    >>> terminations["vehicle_2"], round(infos["vehicle_2"]["world_honest_cost"], 2)
     (True, 39.95)
 
     """

@@ -59,7 +59,7 @@ class _Cache(NullCache):  # type: ignore[misc]
         name = self._name(sig, target_context.codegen())
         stored = load_data(name, lambda data: CompileResult._rebuild(target_context, *pickle.loads(data)))  # noqa: S301
         if stored is None:  # then numba compiles the function
-            announce_compilation()
+            announce_compilation(self._function.__module__)
         return stored
 
     def save_overload(self, sig: Any, data: Any) -> None:

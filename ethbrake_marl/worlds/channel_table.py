@@ -11,7 +11,7 @@ from ethbrake_marl.files.model import models_in
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.worlds.channel import PRESETS, V2X
 
-UNITS = {"s": "s", "mps": "m/s"}  # suffix of a key -> its unit
+UNITS = {"s": "s", "m": "m", "mps": "m/s"}  # suffix of a key -> its unit
 NO_VALUE = "–"  # the key has no effect with this preset, or no value
 
 

@@ -39,7 +39,7 @@ _HONEST = tuple(
     for test in ("", "-brake-only", "-obstacle")
 )
 TABLES: dict[str, tuple[str, ...]] = {
-    "| who drives Vehicle 2 | knows | main test": _HONEST,
+    "| who drives Vehicle 2 | main test": _HONEST,
     "| who drives Vehicle 2 | knows | collisions | first-impact harm | total harm | honest cost": _HONEST,
     "| agent | what it does | knows": ("ethbrake evaluate --agents ladder --json",),
 }

@@ -250,7 +250,6 @@ def test_tables__on_the_page_and_in_a_file_are_those_of_the_committed_rows() -> 
     for path, begin, end in (
         (results / "benchmark.md", "## Results\n", "\n| "),
         (results.parent / "findings.md", "## Which method learns best", "\n## "),
-        (results.parents[1] / "README.md", "- **[The benchmark]", "\n\n"),
     ):
         text = " ".join(path.read_text("utf-8").partition(begin)[2].partition(end)[0].split())
         said = re.findall(r"-?\d+\.\d+(?: %)? \[[^]]*\]", text)

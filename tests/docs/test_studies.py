@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.printed import rows
 from tests.docs.site import DOCS, load
+from tests.fixtures.commands import rows_of
 
 drawings = load("../drawings")
 
@@ -75,6 +77,19 @@ def test_morl_front__its_numbers_agree_with_each_other_and_with_full_braking() -
             assert measured["full_braking"] == full.round(4).tolist()
             assert measured["hypervolume"] == pytest.approx(volume_below(full.round(4), points))
             assert measured["hypervolume_below_roof"] == pytest.approx(volume_below(np.full(3, found["roof"]), points))
+
+
+def test_ablation__page_and_file_say_the_same() -> None:
+    costs = defaultdict(list)
+    for row in rows_of(DOCS / "results" / "ablation.csv"):
+        costs[f"`{row['level']}`"].append(
+            [float(row[key]) for key in ("first_impact_harm", "total_harm", "honest_cost")]
+        )
+    shown = {
+        row[0]: [cell.partition(" [")[0] for cell in row[2:5]]
+        for row in rows("cooperation", "## Harm on each level")[1:]
+    }
+    assert shown == {level: [f"{mean:.2f}" for mean in np.mean(each, axis=0)] for level, each in costs.items()}
 
 
 competence = load("../studies/competence")

@@ -125,6 +125,7 @@ def test_cost__of_all_steps_is_the_harm_that_the_reward_counts(reward: str, coun
     infos = [arrays(game, state, step, 7, np.array([body])) for body in (1, 2, 3)]
     for name, harms in (("first_impact_harm", state.borne_harm("first")), ("total_harm", state.borne_harm("total"))):
         assert np.stack([info[name] for info in infos], axis=1) == near(harms)
+    assert all(np.array_equal(info["world_honest_cost"], state.harm("honest")) for info in infos)
     assert (
         state.line[:, TOTAL, 0].any()
         and cost == near(state.harm(count))

@@ -45,10 +45,10 @@ def told(env: Any, steps: int, learners: list[str]) -> list[Any]:
     return values
 
 
-def cuts_of(values: list[Any]) -> list[bool]:
-    """The info ``cut`` of each return, taken out of the infos of all agents, which agree."""
-    cuts = [{info.pop("cut") for info in value[-1].values()} for value in values]
-    return [cut for (cut,) in cuts]
+def taken(values: list[Any], name: str) -> list[Any]:
+    """The info ``name`` of each return, taken out of the infos of all agents, which agree."""
+    columns = [{info.pop(name) for info in value[-1].values()} for value in values]
+    return [column for (column,) in columns]
 
 
 def check_ends(scenario: eb.Scenario, steps: int) -> None:
@@ -61,7 +61,9 @@ def check_ends(scenario: eb.Scenario, steps: int) -> None:
     ]
     ends = [len(value) == 4 and any(value[2].values()) for value in runs[0]]
     assert sum(ends) == 5
-    assert cuts_of(runs[0]) == ends and not any(cuts_of(runs[1]))
+    assert taken(runs[0], "cut") == ends and not any(taken(runs[1], "cut"))
+    costs = [np.array(taken(run, "world_honest_cost")) for run in runs]
+    assert (costs[0] <= costs[1]).all() and not (costs[0] != costs[1])[~np.array(ends)].any()  # motion at the horizon
     assert str(runs[0]) == str(runs[1])
 
 
@@ -114,8 +116,9 @@ def test_most_steps__from_each_world_s_own_first_decision() -> None:
             _, reward, terminated, cut, info = alone.step(action[k])
         assert (reward, terminated, cut) == (rewards[k], False, True)
         final = {name: column[k] for name, column in infos["final_info"].items() if name in info}
-        assert final["cut"] and not info["cut"]
-        assert {**final, "world_seed": 0, "world": 0, "cut": 0} == {**info, "world_seed": 0, "world": 0, "cut": 0}
+        assert final["cut"] and not info["cut"] and final["world_honest_cost"] < info["world_honest_cost"]
+        same = {"world_seed": 0, "world": 0, "cut": 0, "world_honest_cost": 0}  # motion is priced at the horizon alone
+        assert {**final, **same} == {**info, **same}
 
 
 def test_terminal__is_paid_by_hand_and_through_gymnasium() -> None:

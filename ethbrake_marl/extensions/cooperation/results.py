@@ -159,7 +159,7 @@ def ablation_results(plan: Ablation, measured: Sequence[LevelResult]) -> Json:
             "machine": machine,
             "date": datetime.now(UTC).date().isoformat(),
         },
-        "conditions": f"{conditions(plan, plan.episodes)} {machine}.",
+        "conditions": f"{conditions(plan)} {machine}.",
         **comparison(measured, plan.search_episodes),
     }
 
@@ -169,25 +169,25 @@ def write_ablation(plan: Ablation, measured: Sequence[LevelResult], results: Jso
     json_file, csv_file, picture = (plan.folder / name for name in (JSON, CSV, FIGURE))
     write_output(json_file, f"{json.dumps(results, indent=2, allow_nan=False)}\n".encode(), force=True)
     write_output(csv_file, levels_csv(measured, plan.search_episodes).encode(), force=True)
-    write_picture(picture, ablation_figure(results, conditions(plan, plan.search_episodes)), force=True)
+    figure = ablation_figure(results, f"{conditions(plan)} Its line is as far below a bar as in these worlds.")
+    write_picture(picture, figure, force=True)
     return [json_file, csv_file, picture]
 
 
-def conditions(plan: Ablation, number: int) -> str:
-    """Sentences that say how the results over ``number`` worlds were made."""
+def conditions(plan: Ablation) -> str:
+    """Sentences that say how the results were made."""
     recipes = ", ".join(
         f"{name} (rewarded for {recipe.reward.harm_count.words})"
         for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
     )
     alike = plan.levels[0].same_vehicles
     same_words, draw_words = ("the same ", "") if alike else ("", ", drawn with the same random numbers")
-    first = "" if number == plan.episodes else "first "
     scope = "other seeds and other worlds" if plan.seeds > 1 else "other worlds only: one seed says nothing of others"
     optimum = f"{count_of(plan.search_episodes, 'world')}, {plan.budget:,} candidates per world and count."
     return (
         f"{recipes}; {count_of(plan.seeds, 'seed')}, {plan.steps_per_learner:,} decisions of each learner, rounded up"
         " to whole updates. Harm and honest cost are means per world in m²/s² on"
-        f" {same_words}{first}{count_of(number, 'world')} of seed {SEED}{draw_words}; 95 % intervals for {scope}. Joint"
+        f" {same_words}{count_of(plan.episodes, 'world')} of seed {SEED}{draw_words}; 95 % intervals for {scope}. Joint"
         f" optimum: the least harm or cost known that the learners can cause, in the first {optimum}"
     )
 
@@ -270,7 +270,8 @@ def share(heading: str) -> Column:
 def ablation_figure(results: Json, caption: str) -> Figure:
     """Bars of what is minimised at each level or swept value, with 95 % intervals; a panel for each count.
 
-    A bar far above full braking at most levels is cut. Means are over the worlds in which the joint optimum is known.
+    A bar far above full braking at most levels is cut. Means are over all worlds; the line of the joint optimum is as
+    far below the bar as in the worlds in which it is known.
     """
     levels, recipes = results["levels"], results["settings"]["recipes"]
     names = list(dict.fromkeys(level["level"] for level in levels))
@@ -284,7 +285,7 @@ def ablation_figure(results: Json, caption: str) -> Figure:
     for axes, count in zip(panels, counts, strict=True):
         for number, algorithm in enumerate(recipes):
             shown = [level for level in levels if level["algorithm"] in (None, algorithm)]
-            harms = [Estimate(**level[count.name]["searched"]["harm"]) for level in shown]
+            harms = [Estimate(**level[count.name]["harm"]) for level in shown]
             ends = list(zip(*((h.value - h.ends[0], h.ends[1] - h.value) for h in harms), strict=True))
             places = [at[level["level"]] + bar * (number - (len(recipes) - 1) / 2) for level in shown]
             colour = series_style(1 if number == 0 else number + 3)["color"]
@@ -292,22 +293,23 @@ def ablation_figure(results: Json, caption: str) -> Figure:
             for place, harm in zip(places, harms, strict=True):
                 mean, at_top = f"{harm.value:.2f}", axes.get_xaxis_transform()
                 axes.text(place, 0.94, mean, transform=at_top, ha="center", fontsize=8)
-        _draw_bounds(axes, [(at[level["level"]], level[count.name]["searched"]) for level in levels], 0.42 * unit)
+        _draw_bounds(axes, [(at[level["level"]], level[count.name]) for level in levels], 0.42 * unit)
         if results["settings"]["swept"] is None:
             words = [name.removeprefix("cooperation-").removeprefix("level-").replace("-", "\n", 1) for name in names]
             axes.set_xticks([at[name] for name in names], words, fontsize=8)
-        braking = [level[count.name]["searched"]["full_brake"]["value"] for level in levels]
+        braking = [level[count.name]["full_brake"]["value"] for level in levels]
         axes.set_ylim(0.0, min(1.1 * axes.get_ylim()[1], MOST_SHOWN * float(np.median(braking))))
         axes.set(title=axis_title(count), xlabel=results["settings"]["swept"] or "")
     return finish(figure, " ".join([*results["undertrained"], caption]), panels[0], columns=3, fontsize=8.5)
 
 
 def _draw_bounds(axes: Axes, points: list[tuple[float, Json]], half: float) -> None:
-    for key, label, colour in (
-        ("full_brake", "full braking", GREY),
-        ("best_known", "joint optimum", series_style(3)["color"]),
-    ):
-        known_points = [(x, entry[key]["value"]) for x, entry in points if entry[key] is not None]
-        for number, (x, value) in enumerate(known_points):
-            name = "" if number else label
-            axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=name)
+    braking = [(x, entry["full_brake"]["value"]) for x, entry in points]
+    optimum = [
+        (x, entry["harm"]["value"] - (entry["searched"]["harm"]["value"] - entry["searched"]["best_known"]["value"]))
+        for x, entry in points
+        if entry["searched"]["best_known"] is not None
+    ]
+    for label, colour, lines in (("full braking", GREY, braking), ("joint optimum", series_style(3)["color"], optimum)):
+        x, value = np.transpose(lines)
+        axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=label)

@@ -38,6 +38,7 @@ from ethbrake_marl.motion.layout import (
 )
 
 MESSAGES_KEY = "messages"  # of the memory in `State.memories`
+PLACE_ERRORS_KEY = "place_errors"  # of errors of places in what is sent, [n, N + 1] m
 
 Piece = Literal["place", "speed", "acceleration", "braking_capacity", "latency", "mass", "intent", "plan"]
 PIECES: tuple[Piece, ...] = get_args(Piece)
@@ -49,8 +50,9 @@ PLACE = 1  # of its front (m along the road; 0 is the front of Vehicle 1 at the 
 SAMPLE_SPEED = 2  # m/s
 SAMPLE_FORCE = 3  # m/s2
 OBSTACLE_HIT = 4  # 1 once Vehicle 1 has hit the obstacle
-INTENT = 5  # command chosen at the last decision (m/s2); the rows before it can be measured
-PLAN = slice(6, 6 + PLAN_NUMBERS)  # plan in force since the last decision (``episode.plans``)
+PLACE_ERROR = 5  # of its place, as others receive it (m)
+INTENT = 6  # command chosen at the last decision (m/s2); the rows before it can be measured
+PLAN = slice(7, 7 + PLAN_NUMBERS)  # plan in force since the last decision (``episode.plans``)
 SAMPLE_ROWS = PLAN.stop
 
 # columns of `MessageMemory.channel`
@@ -133,6 +135,7 @@ def present(state: State) -> Floats:
     sample[:, OBSTACLE_HIT], sample[:, INTENT] = state.line[:, HIT, :1], np.where(waits, 0.0, state.wanted)
     sample[:, PLAN] = np.where(waits[:, np.newaxis], np.nan, plans_of(state))
     sample[:, PLACE, 0], sample[:, PLACE, 2:] = state.line[:, GAP, 0], -np.cumsum(state.gaps_m, axis=1)
+    sample[:, PLACE_ERROR] = state.memories.get(PLACE_ERRORS_KEY, 0.0)
     return sample
 
 
@@ -194,11 +197,15 @@ def _sample(memory: MessageMemory, state: State, way_m: Floats, rows: Bools) -> 
 
 
 def newest_samples(state: State, observer: int) -> Floats:
-    """Newest sample (recorded motion) that the body ``observer`` has of each body, [n, SAMPLE_ROWS, N + 1]."""
+    """Newest sample (recorded motion) that the body ``observer`` has of each body, [n, SAMPLE_ROWS, N + 1].
+
+    Its own place is exact, others' places contain their errors.
+    """
     memory: MessageMemory = state.memories[MESSAGES_KEY]
     if not memory.is_periodic:
         return present(state)
     news = memory.news[:, :, observer].copy()
+    news[:, PLACE] += news[:, PLACE_ERROR]
     news[:, :, observer], news[:, PLACE, 0] = memory.samples[:, 0, :, observer], memory.samples[:, 0, PLACE, 0]
     return news
 

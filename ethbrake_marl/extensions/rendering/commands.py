@@ -26,8 +26,8 @@ def watch_command(
     output: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.gif|FILE.mp4|FILE.png|FILE.xosc|-",
-            help="File for the film; .png: three moments of it; .xosc: OpenSCENARIO; -: print it as text.",
+            metavar="FILE.gif|FILE.mp4|FILE.png|FILE.svg|FILE.xosc|-",
+            help="File for the film; .png, .svg: three moments of it; .xosc: OpenSCENARIO; -: print it as text.",
             show_default=f"a window, or {DEFAULT_FILE} if none can be opened",
         ),
     ] = None,
@@ -40,9 +40,10 @@ def watch_command(
 ) -> None:
     """Show a real-time film of agents that drive the same world.
 
-    The film shows the road to scale, the commands, the impacts and the harm. A PNG file shows three moments: the alert,
-    the hardest impact under any agent, and the end; the text shows the alert, each pair's first impact in a time step,
-    and the end. An OpenSCENARIO file (1.3) holds the trajectories under one agent; its road (OpenDRIVE) is beside it.
+    The film shows the road to scale, the commands, the impacts and the harm. A PNG or SVG file shows three moments: the
+    alert, the hardest impact under any agent, and the end; the text shows the alert, each pair's first impact in a time
+    step, and the end. An OpenSCENARIO file (1.3) holds the trajectories under one agent; its road (OpenDRIVE) is
+    beside it.
     """
     from ethbrake_marl.agent_names import open_game, require_learner, teams_of
     from ethbrake_marl.cli.settings import read_settings
@@ -89,7 +90,7 @@ def watch_command(
                 out.note(str(error))
             out.check(Path(DEFAULT_FILE))
         path = output or Path(DEFAULT_FILE)
-        what = "pictures" if path.suffix.lower() == ".png" else "film"
+        what = "pictures" if path.suffix.lower() in (".png", ".svg") else "film"
         out.write(path, WRITERS[path.suffix.lower()](films), what=what)
 
 

@@ -1,4 +1,4 @@
-"""Films of episodes in real time, as GIF, MP4 or in a window; and single moments of them, as PNG or text."""
+"""Films of episodes in real time, as GIF, MP4 or in a window; and single moments of them, as PNG, SVG or text."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ethbrake_marl.agents.team import Team, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, need
-from ethbrake_marl.extensions.rendering.picture import HEIGHT, WIDTH, Frame, picture
+from ethbrake_marl.extensions.rendering.picture import HEIGHT, WIDTH, Frame, picture, vector_picture
 from ethbrake_marl.extensions.rendering.scene import Motion, Scene
 from ethbrake_marl.extensions.rendering.viewer import Screen
 from ethbrake_marl.motion.layout import TOTAL
@@ -111,21 +111,43 @@ def write_mp4(films: Films) -> bytes:
         return path.read_bytes()
 
 
-def write_png(films: Films) -> bytes:
-    """PNG file: for each film, the alert, the hardest impact under any team, and the end."""
-    from PIL import Image
-
+def moments(films: Films) -> Iterator[Scene]:
+    """For each film: the alert, the hardest impact under any team, and the end."""
     numbered = [(k, scene) for scenes in films.values() for k, scene in enumerate(scenes)]
     impacts = [(impact.closing_mps, -k) for k, scene in numbered for impact in scene.impacts]
     hardest = -max(impacts, default=(0.0, 0))[1]  # number of the first scene that shows the hardest impact
     last = max(map(len, films.values())) - 1
-    rows = []
     for title, scenes in films.items():
         for scene in (scenes[min(k, len(scenes) - 1)] for k in sorted({0, hardest, last})):
-            rows.append(picture(scene._replace(title=f"{title}, harm {scene.line[TOTAL, :-1].sum():.1f} m2/s2"))[:ROAD])
+            yield scene._replace(title=f"{title}, harm {scene.line[TOTAL, :-1].sum():.1f} m2/s2")
+
+
+def write_png(films: Films) -> bytes:
+    """PNG file with the ``moments`` of films."""
+    from PIL import Image
+
+    rows = [picture(scene)[:ROAD] for scene in moments(films)]
     buffer = io.BytesIO()
     Image.fromarray(np.concatenate(rows)).quantize(GIF_COLOURS).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
 
 
-WRITERS: dict[str, Callable[[Films], bytes]] = {".gif": write_gif, ".mp4": write_mp4, ".png": write_png}
+def write_svg(films: Films) -> bytes:
+    """SVG file with the ``moments`` of films."""
+    rows = [
+        f'<svg y="{k * ROAD}" width="{WIDTH}" height="{ROAD}">\n{vector_picture(scene)}\n</svg>'
+        for k, scene in enumerate(moments(films))
+    ]
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{len(rows) * ROAD}"'
+        f' viewBox="0 0 {WIDTH} {len(rows) * ROAD}" font-family="Arial, Helvetica, sans-serif">'
+    )
+    return "\n".join([head, *rows, "</svg>\n"]).encode()
+
+
+WRITERS: dict[str, Callable[[Films], bytes]] = {
+    ".gif": write_gif,
+    ".mp4": write_mp4,
+    ".png": write_png,
+    ".svg": write_svg,
+}

@@ -1,10 +1,11 @@
-"""A scene as a picture, drawn with Pillow, whose font is the same on every computer."""
+"""A scene as a picture: pixels, drawn with Pillow, whose font is the same on every computer; or SVG, for slides."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from functools import cache
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ethbrake_marl.errors import plain_text
 from ethbrake_marl.extensions.rendering.scene import BODY_M, Impact, Scene
-from ethbrake_marl.motion.layout import GAP, HIT, SPEED
+from ethbrake_marl.motion.layout import GAP, HIT, MASS, SPEED
 
 Frame = NDArray[np.uint8]  # [HEIGHT, WIDTH, 3]
 
@@ -23,8 +24,13 @@ MARGIN = 12
 ROAD_TOP, ROAD_BOTTOM = 84, 138
 LANE = (ROAD_TOP + ROAD_BOTTOM) // 2
 BODY = 13  # half of a body's height
+TRUCK_T = 12.0  # a vehicle of this mass is drawn as a truck: the EU's category N3
 PANEL_TOP = 172
 SPACINGS_M = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)  # between written distances, of which at most twelve are in view
+
+SVG_ANCHORS = {  # of Pillow -> of SVG, and way down to the baseline as a share of the size
+    "la": ("start", 0.8), "ra": ("end", 0.8), "ma": ("middle", 0.8), "mm": ("middle", 0.36), "ms": ("middle", 0.0),
+}  # fmt: skip
 
 PAPER, INK, GREY, PALE = "#ffffff", "#1a1a1a", "#6b6b6b", "#eeeeee"
 ASPHALT, DASH, GLASS = "#4a4d52", "#e8e8e8", "#dfefff"
@@ -88,9 +94,52 @@ class Pen:
         return np.array(self.image.reduce(FINE))
 
 
+class VectorPen(Pen):
+    """Pen whose ``elements`` are SVG, without a background. Text is as wide as in the reader's font."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self.elements = list[str]()
+
+    def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
+        self.elements.append(
+            f'<rect x="{left:.2f}" y="{top:.2f}" width="{max(right - left, 1):.2f}" height="{max(bottom - top, 1):.2f}"'
+            f' rx="2" fill="{fill}" stroke="{edge or "none"}"/>'
+        )
+
+    def line(self, x1: float, y1: float, x2: float, y2: float, colour: str, width: float = 1.0) -> None:
+        self.elements.append(
+            f'<path d="M{x1:.2f} {y1:.2f}L{x2:.2f} {y2:.2f}" stroke="{colour}" stroke-width="{width}"/>'
+        )
+
+    def shape(self, points: Sequence[tuple[float, float]], fill: str, edge: str | None = None) -> None:
+        places = " ".join(f"{x:.2f},{y:.2f}" for x, y in points)
+        self.elements.append(f'<polygon points="{places}" fill="{fill}" stroke="{edge or "none"}"/>')
+
+    def write(self, x: float, y: float, words: str, colour: str, size: int, anchor: str = "la") -> None:
+        across, down = SVG_ANCHORS[anchor]
+        self.elements.append(
+            f'<text x="{x:.2f}" y="{y + down * size:.2f}" text-anchor="{across}" font-size="{size}" fill="{colour}">'
+            f"{escape(words)}</text>"
+        )
+
+
 def picture(scene: Scene) -> Frame:
     """Picture of a scene, [304, 800, 3] uint8."""
     pen = Pen(scene)
+    draw_scene(pen)
+    return pen.frame()
+
+
+def vector_picture(scene: Scene) -> str:
+    """SVG elements of a picture of a scene."""
+    pen = VectorPen(scene)
+    draw_scene(pen)
+    return "\n".join(pen.elements)
+
+
+def draw_scene(pen: Pen) -> None:
+    scene = pen.scene
     draw_road(pen)
     for body in range(1, len(scene.wanted)):
         draw_vehicle(pen, body)
@@ -102,7 +151,6 @@ def picture(scene: Scene) -> Frame:
     pen.write(MARGIN, 10, fitting(cut, WIDTH - 3 * MARGIN - text_width(scene.clock, 18), 15), GREY, 15)
     pen.write(WIDTH - MARGIN, 8, scene.clock, INK, 18, "ra")
     pen.write(MARGIN, HEIGHT - 22, scene.harm, INK, 15)
-    return pen.frame()
 
 
 def draw_road(pen: Pen) -> None:
@@ -124,7 +172,13 @@ def draw_road(pen: Pen) -> None:
 
 def draw_vehicle(pen: Pen, body: int) -> None:
     left, right = pen.ends(body)
-    pen.box(left, LANE - BODY, right, LANE + BODY, vehicle_colour(body))
+    if pen.scene.car[MASS, body] >= TRUCK_T:  # a trailer, wider than the cab, and the coupling between them
+        cab, trailer = left + (right - left) * 0.7, left + (right - left) * 0.62
+        pen.line(trailer, LANE, cab, LANE, INK, 4.0)
+        pen.box(cab, LANE - BODY + 2, right, LANE + BODY - 2, vehicle_colour(body))
+        pen.box(left, LANE - BODY - 2, trailer, LANE + BODY + 2, vehicle_colour(body))
+    else:
+        pen.box(left, LANE - BODY, right, LANE + BODY, vehicle_colour(body))
     glass = left + (right - left) * 0.72
     pen.box(glass, LANE - BODY + 4, glass + (right - left) * 0.1, LANE + BODY - 4, GLASS)
     if pen.scene.command(body) < 0.0:
@@ -191,5 +245,5 @@ def show_impacts(pen: Pen) -> None:
         half = text_width(words, 15) / 2
         middle = sum(x(impact) for impact in hardest) / len(hardest)
         middle = min(max(middle, MARGIN + half), WIDTH - MARGIN - half)
-        pen.box(middle - half - 5, 34, middle + half + 5, 54, FLASH)
-        pen.write(middle, 44, words, INK, 15, "mm")
+        pen.box(middle - half - 5, 26, middle + half + 5, 45, FLASH)  # between the title and the higher row of gaps
+        pen.write(middle, 35.5, words, INK, 15, "mm")

@@ -38,12 +38,11 @@ def player(
     """
     result, agents, worlds = compared.result, list(records), list[dict[str, Any]]()
     for (row, kind), *episodes in zip(kinds.items(), *records.values(), strict=True):
-        first, total = (result[focus][count.column][row] for count in IMPACT_COUNTS)
         worlds.append(
             {
                 "number": int(result.worlds["world"][row]),
                 "kind": printable_text(kind),
-                "why": printable_text(f"{focus}: harm {first:.2f} first-impact, {total:.2f} total"),
+                "value": float(result[focus][compared.harm_count.column][row]),
                 "conditions": quantities(episodes[0].initial),
                 "episodes": [episode_data(record) for record in episodes],
             }
@@ -60,6 +59,7 @@ def player(
         vehicles=compared.scenario.vehicles,
         shielded=any(episode["stepped"] for world in worlds for episode in world["episodes"]),
         name=DATA,
+        ranked_by=f"{compared.harm_count.words} of {focus} (m²/s²)",
         episodes=data(DATA, content),
         body=BODY_M,
     )

@@ -257,6 +257,12 @@ def deceleration_figure(
 
 
 NOTE = "Numbers at impacts: closing speed in m/s. Vehicles are drawn without length. Harm in m²/s²."
+CORNERS: tuple[dict[str, Any], ...] = (  # places of the numbers of neighbouring pairs, which may strike at one moment
+    {"xytext": (-7, 7), "ha": "right", "va": "bottom"},
+    {"xytext": (7, -7), "ha": "left", "va": "top"},
+    {"xytext": (7, 7), "ha": "left", "va": "bottom"},
+    {"xytext": (-7, -7), "ha": "right", "va": "top"},
+)
 IMPACT: dict[str, Any] = {"marker": "X", "s": 60.0, "edgecolor": "black", "linewidth": 0.8, "zorder": 5}
 
 
@@ -327,7 +333,7 @@ def _positions(axes: Axes, record: EpisodeRecord) -> None:
         speed_mps = rows.closing_speed_mps[k]
         axes.annotate(
             f"{speed_mps:.1f}" if speed_mps >= 0.05 else "< 0.1",  # 0.0 would mean no impact
-            (rows.time_s[k], at[k]), xytext=(7, -7), textcoords="offset points", fontsize=8.5, va="top", zorder=6,
+            (rows.time_s[k], at[k]), textcoords="offset points", fontsize=8.5, zorder=6, **CORNERS[rows.pair[k] % 4],
             bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
         )  # fmt: skip
 

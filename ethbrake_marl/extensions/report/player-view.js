@@ -1,6 +1,7 @@
 // What the player draws: the road with its vehicles, and curves over time (traces) below the road. Both are SVG.
 
 const SVG = "http://www.w3.org/2000/svg";
+const LABEL = 58; // width of a closing speed and a blank
 
 function draw(name, attributes = {}, ...children) {
   const element = document.createElementNS(SVG, name);
@@ -104,7 +105,8 @@ class Lane {
 
   flashesAt(time, fronts) {
     const shown = new Map(struckAround(this.episode, time).map((impact) => [impact[1], impact]));
-    return [...shown.values()].map(([, pair, closing, first]) => {
+    let free = Infinity; // the numbers stand side by side, from the right
+    return [...shown.values()].sort((a, b) => a[1] - b[1]).map(([, pair, closing, first]) => {
       const x = this.x(pair < 0 ? fronts[0] : fronts[pair + 1]);
       const r = this.half + 5;
       const points = Array.from({ length: 16 }, (_, k) => {
@@ -113,7 +115,8 @@ class Lane {
         return `${(x + across).toFixed(1)},${(this.middle + down).toFixed(1)}`;
       });
       const speed = `${closing < 0.05 ? "< 0.1" : plain(closing, 1)} m/s`;
-      const text = draw("text", { class: "closing", x, y: 12, "text-anchor": "middle" }, speed);
+      free = Math.min(x, free - LABEL);
+      const text = draw("text", { class: "closing", x: free, y: 12, "text-anchor": "middle" }, speed);
       const star = draw("polygon", { class: first ? "flash" : "flash later", points: points.join(" ") });
       return draw("g", {}, star, text);
     });

@@ -28,7 +28,7 @@ class Player {
     const kinds = new Map();
     this.data.worlds.forEach((world, k) => {
       if (!kinds.has(world.kind)) kinds.set(world.kind, make("optgroup", { label: world.kind }));
-      kinds.get(world.kind).append(make("option", { value: k }, `World ${world.number} · ${world.why}`));
+      kinds.get(world.kind).append(make("option", { value: k }, `World ${world.number}: ${plain(world.value, 2)}`));
     });
     this.find("world").append(...kinds.values());
     this.fillAgents();

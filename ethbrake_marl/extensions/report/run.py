@@ -1,4 +1,4 @@
-"""Report of a training run: learning curves, the three tests, and several learners."""
+"""Report of a training run: learning curves, the three tests, the rule ``plan``, and several learners."""
 
 from __future__ import annotations
 
@@ -12,27 +12,40 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from ethbrake_marl.agent_names import AGENTS
 from ethbrake_marl.episode.counts import IMPACT_COUNTS, HarmCount
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.evaluation.comparison import Comparison
+from ethbrake_marl.evaluation.evaluate import evaluate
 from ethbrake_marl.evaluation.results import write_results
 from ethbrake_marl.evaluation.statistics import difference, mean
 from ethbrake_marl.evaluation.summary import BASELINE, caption
 from ethbrake_marl.extensions.report.best_known import REPORT_MEASURES
 from ethbrake_marl.extensions.report.figures import curves_figure, harm_against_total_gap, trajectories
 from ethbrake_marl.extensions.report.page import Section, drawing, table
-from ethbrake_marl.extensions.report.report import SHORT_TABLE, ReportPage, Test
+from ethbrake_marl.extensions.report.report import SHORT_TABLE, ReportPage, Test, short_table
 from ethbrake_marl.extensions.report.style import axis_title
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
 from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.training.experiment import HYBRID, SHIELDED, TEAM, TEAM_BASELINES, Experiment, Tables, without
+from ethbrake_marl.training.experiment import (
+    HYBRID,
+    SHIELDED,
+    TEAM,
+    TEAM_BASELINES,
+    Experiment,
+    Tables,
+    usable,
+    without,
+)
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
 from ethbrake_marl.worlds.scenario import Scenario
 
 REPORT_FILE = "report.html"
+RULE = "plan"  # needs no training
+RULE_WORLDS = 500  # in which it is compared; an evaluation of all would take longer than a training
 TESTS = {
     "paper-random": "Main test: Vehicle 2 may drive, and there is no obstacle ahead of Vehicle 1. Neither first-impact"
     " nor total harm includes pushing Vehicle 1; the honest cost does.",
@@ -52,8 +65,10 @@ class RunReport:
         tests, stage_numbers = other_tests(compared.scenario) if single else [], count()
 
         def begin(stage: str) -> None:
-            tell(Progress(f"report{stage and ': '}{stage}", next(stage_numbers), 2 + len(tests)))
+            tell(Progress(f"report{stage and ': '}{stage}", next(stage_numbers), 3 + len(tests)))
 
+        begin(f"the rule {RULE}")
+        rule = beside_rule(experiment, tell)
         test_results: dict[str, Comparison] = {}
         for test in tests:
             begin(f"the same policy in {test.name}")
@@ -64,12 +79,32 @@ class RunReport:
                 )
             write_results(folder, test_results[test.name].table, name=f"results-{test.name}.json", force=True)
         learners = [] if single else learners_sheets(compared)
+        sheets = learners if rule is None else [short_sheet(rule), *learners]
         begin("figures")
         figures = run_figures(experiment)
         begin("page and episodes")
-        report_page(experiment, test_results, figures, learners).write(folder / REPORT_FILE, force=True)
+        report_page(experiment, test_results, figures, rule, learners).write(folder / REPORT_FILE, force=True)
         begin("")
-        return [short_sheet(compared), *learners], f"report with all measures: {folder / REPORT_FILE}"
+        return [short_sheet(compared), *sheets], f"report with all measures: {folder / REPORT_FILE}"
+
+
+def beside_rule(experiment: Experiment, tell: OnProgress) -> Comparison | None:
+    """The learned agents and the rule in the first worlds of the list; None where the rule cannot drive."""
+    compared, rules = experiment.compared, [RULE] if RULE in AGENTS else []
+    rules = usable("rules", rules, lambda name: evaluate(compared.scenario, name, episodes=1), tell)
+    worlds = min(compared.result.n, RULE_WORLDS)
+    return experiment.in_another(compared.scenario, worlds, (BASELINE, *rules), Tables.measures) if rules else None
+
+
+def rule_section(compared: Comparison, learned: str) -> Section:
+    result, count = compared.result, compared.harm_count
+    more = difference(result[learned][count.column], result[RULE][count.column], result.clusters)
+    words = count.words
+    text = (
+        f"The rule {RULE} needs no training. {words.capitalize()} of the {learned} minus {words} of the rule, mean of"
+        f" the first {result.n:,} worlds of the list: {more.in_words()} m²/s²."
+    )
+    return Section(f"The rule {RULE}", [text, short_table(compared.table, count)])
 
 
 def other_tests(scenario: Scenario) -> list[Scenario]:
@@ -155,7 +190,11 @@ def typical_row_of(compared: Comparison, learned: str) -> int:
 
 
 def report_page(
-    experiment: Experiment, test_results: Mapping[str, Comparison], figures: Sequence[Markup], learners: Sequence[Sheet]
+    experiment: Experiment,
+    test_results: Mapping[str, Comparison],
+    figures: Sequence[Markup],
+    rule: Comparison | None,
+    learners: Sequence[Sheet],
 ) -> ReportPage:
     """Page about a training run: settings, the compared agents, and other tests."""
     trained, compared, learned = experiment.trained, experiment.compared, experiment.learned
@@ -193,7 +232,10 @@ def report_page(
         summary,
         {key: value for key, value in facts.items() if value},
         focus=learned,
-        sections=[Section("Several learners", [table(sheet) for sheet in learners])],
+        sections=[
+            *([] if rule is None else [rule_section(rule, learned)]),
+            Section("Several learners", [table(sheet) for sheet in learners]),
+        ],
         figures=figures,
         tests={title_of(test): Test(TESTS[test], comparison) for test, comparison in test_results.items()},
         remarks=[stopped] if trained.status == "interrupted" else (),

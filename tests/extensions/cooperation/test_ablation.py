@@ -12,7 +12,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import ALL_IMPACTS, BUILT_IN_COUNTS, FIRST_IMPACTS
 from ethbrake_marl.extensions.cooperation.ablation import Answer, LevelResult, can_imitate, least_known
 from ethbrake_marl.extensions.cooperation.levels import Level
-from ethbrake_marl.extensions.cooperation.results import comparison, levels_csv
+from ethbrake_marl.extensions.cooperation.results import ablation_figure, comparison, levels_csv
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.motion.layout import FAR_M, GAP
 from tests.fixtures.commands import Command
@@ -140,6 +140,8 @@ def test_ablation__trains_compares_and_goes_on(
     assert found["levels"][1]["first"]["full_brake"] == found["levels"][2]["first"]["full_brake"]
     for condition in ("(rewarded for honest cost)", "first 2 worlds", "2 seeds, 128 decisions"):
         assert condition in found["conditions"]
+    bars = [bar.get_height() for bar in ablation_figure(found, "").axes[0].patches]
+    assert bars == [level["honest"]["harm"]["value"] for level in found["levels"]]  # of all worlds, as in the tables
     again = ethbrake(*line.split(), *small.split(), "--output", "out", "--json")
     assert again.status == 0 and json.loads(again.out)["levels"] == found["levels"]
     other = ethbrake(*line.split(), *small.replace("12", "13").split(), "--output", "out")

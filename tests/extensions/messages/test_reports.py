@@ -8,7 +8,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.motion.layout import GAP, Floats
 from tests.extensions.messages.line import LINE, played, seen_by, stepped
 from tests.refused import refused
 
@@ -63,6 +63,40 @@ def test_noise__is_normal_and_the_same_in_every_batch() -> None:
     assert abs(np.corrcoef(np.concatenate([many[0], many[1]], axis=1)[:, [0, 2, 3, 5]].T) - np.eye(4)).max() < 0.06
     for error, alone in zip(many, errors(41, 1), strict=True):
         assert error[41].tobytes() == alone[0].tobytes()
+
+
+def test_noise_of_places__is_in_the_gaps_that_others_see() -> None:
+    """Vehicle 2 knows its own place, so its gaps have one error each; that ahead of Vehicle 1 has two for Vehicle 3."""
+    v2x = reports(noise_m=0.5, noise_mps=2.0)
+    scenario = eb.load_scenario("paper-random-obstacle").replace(early_impacts="keep", v2x=v2x)
+    _, game = eb.open_game(scenario)
+    many, alone = (game.reset(scenario.sample(n, 7, first=first)) for n, first in ((5000, 0), (1, 41)))
+    gaps = {body: game.seen(many, body).line[:, GAP, :3] - many.line[:, GAP, :3] for body in (1, 2, 3)}
+    for body, sizes in {1: [0.0, 0.5, 0.5**0.5], 2: [0.5, 0.5, 0.5], 3: [0.5, 0.5**0.5, 0.5]}.items():
+        assert gaps[body].mean(axis=0) == pytest.approx([0.0] * 3, abs=0.03)
+        assert gaps[body].std(axis=0) == pytest.approx(sizes, abs=0.03)
+    assert gaps[2][:, 0] == pytest.approx(-gaps[2][:, 1])  # Vehicle 1 seems as much nearer to the obstacle
+    assert game.seen(many, 2).line[41].tobytes() == game.seen(alone, 2).line[0].tobytes()
+    speeds = game.seen(many, 2).speeds_mps - many.speeds_mps
+    assert abs(np.corrcoef(gaps[2][:, 1], speeds[:, 0])[0, 1]) < 0.06
+    later = stepped(game, many, -0.5)
+    again = game.seen(later, 2).line[:, GAP, 1] - later.line[:, GAP, 1]
+    assert abs(np.corrcoef(gaps[2][:, 1], again)[0, 1]) < 0.06
+
+
+def test_place_in_a_message__has_one_error_for_all_who_receive_it() -> None:
+    """All coast, so a message tells the place for ever; Vehicle 1 is 8 m ahead of Vehicle 2, and 14 m of Vehicle 3."""
+    roles = {"vehicle_1": "coast", "vehicle_2": "learner", "vehicle_3": "coast"}
+    coasting = LINE.replace(roles=roles, speeds_mps=[20, 20, 20], latency_s=[0, 0.5, 0.5])
+    _, game = eb.open_game(coasting.replace(v2x={**OLD, **reports(noise_m=1.0)}))
+    state, errors = game.reset(game.draw(1, 7, 0)), []
+    for _ in range(8):
+        (ahead, behind), both = game.seen(state, 2).gaps_m[0], game.seen(state, 3).gaps_m[0].sum()
+        assert state.gaps_m.tolist() == [[8.0, 6.0]]
+        assert both - 14.0 == pytest.approx(ahead - 8.0)
+        errors.append((ahead - 8.0, behind - 6.0))
+        state = stepped(game, state, 0.0)
+    assert len({round(ahead, 9) for ahead, _ in errors}) > 4 and np.abs(errors).max() > 0.3
 
 
 def test_old_message__keeps_its_error_until_the_next() -> None:
@@ -145,16 +179,18 @@ def v2x(**keys: Any) -> Any:
 
 
 REFUSED: dict[str, Any] = {
-    "v2x.reports = {}: must set noise_mps, bias_mps or liar": v2x(),
+    "v2x.reports = {}: must set noise_mps, noise_m, bias_mps or liar": v2x(),
     "v2x.reports.nois_mps: unknown key; did you mean noise_mps (metres per second)?": v2x(nois_mps=1.0),
     "v2x.reports.noise_mps = -1: must be greater than or equal to 0": v2x(noise_mps=-1),
     "v2x.reports.noise_mps = 0: has no effect; leave it out": v2x(noise_mps=0),
+    "v2x.reports.noise_m = 0: has no effect; leave it out": v2x(noise_m=0),
+    "v2x.reports.noise_m = 51: must be less than or equal to 50": v2x(noise_m=51),
     "v2x.reports.bias_mps = .nan: must be a finite number": v2x(bias_mps=float("nan")),
     "v2x.reports.bias_mps = true: must be a number": v2x(bias_mps=True),
     "v2x.reports.liar = 1: must be text": v2x(liar=1),
     "v2x.reports.liar = vehicle_7: unknown vehicle; ": v2x(liar="vehicle_7"),
     "it is random what the vehicles learn about each other": lambda: eb.worlds_from_table(
-        v2x(noise_mps=1.0)(), {"gap_1_m": [9.0]}
+        v2x(noise_m=1.0)(), {"gap_1_m": [9.0]}
     ),
 }
 

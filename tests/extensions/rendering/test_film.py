@@ -3,6 +3,7 @@
 import io
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.rendering import viewer
 from ethbrake_marl.extensions.rendering.film import WRITERS, film_scenes, films_of
+from ethbrake_marl.extensions.rendering.picture import FLASH, PANEL_TOP, vector_picture, vehicle_colour
+from ethbrake_marl.extensions.rendering.scene import Scene
 from tests.fixtures.commands import Command, Refuse
 from tests.programmes.figures import frames, unequal_share
 
@@ -72,6 +75,46 @@ def test_readme_film__shows_every_impact() -> None:
         shown = [str(impact) for scene in scenes_of("paper-random", agent) for impact in scene.impacts]
         assert [text.split(" at ")[1] for text in dict.fromkeys(shown)] == [f"{speed} m/s" for speed in speeds]
         assert all(shown.count(text) >= 7 for text in shown)  # 0.3 s each
+
+
+def svg_of(scene: Scene) -> ElementTree.Element:
+    return ElementTree.fromstring(f"<svg>{vector_picture(scene)}</svg>")
+
+
+def test_watch__writes_svg_with_the_three_moments_of_the_png(ethbrake: Command, empty_folder: Path) -> None:
+    for name in ("three.svg", "three.png"):
+        answer = ethbrake("watch", "--agents", "full_brake", "--output", name)
+        assert (answer.status, answer.err) == (0, f"pictures: {name}\n")
+    drawn = ElementTree.parse("three.svg").getroot()
+    assert (1, int(drawn.get("height")), int(drawn.get("width")), 4) == np.shape(frames(Path("three.png")))
+    texts = [element.text for element in drawn.iter() if element.tag.endswith("}text")]
+    clocks = [text for text in texts if "after the alert" in text]
+    assert [clock.split(" s")[0] for clock in clocks] == ["0.00", "3.32", "3.90"]
+    assert "impact of Vehicles 2 and 3 at 5.3 m/s" in texts
+
+
+def test_vehicle__of_12_tonnes_is_drawn_as_a_truck() -> None:
+    def boxes(mass_t: float) -> int:
+        scene = scenes_of(CRASH.replace(mass_t=[4.5, mass_t, 4.5]), "coast")[0]
+        blue = vehicle_colour(2)
+        return sum(each.get("fill") == blue and float(each.get("y")) < PANEL_TOP for each in svg_of(scene).iter("rect"))
+
+    assert (boxes(11.9), boxes(12.0)) == (1, 2)  # a cab and a trailer
+
+
+def test_labels__of_impacts_and_gaps_do_not_touch() -> None:
+    close = CRASH.replace(gaps_m=[4.0, 4.0], speeds_mps=[28.0, 34.0, 40.0])
+    scene = next(scene for scene in scenes_of(close, "coast") if len(scene.impacts) == 2)
+    drawn = svg_of(scene)
+    (box,) = (each for each in drawn.iter("rect") if each.get("fill") == FLASH)
+    bottom = float(box.get("y")) + float(box.get("height"))
+    gaps = [
+        float(each.get("y"))
+        for each in drawn.iter("text")
+        if each.text.endswith(" m") and each.get("font-size") == "14"
+    ]
+    assert len(set(gaps)) == 2  # one above the other
+    assert bottom < min(gaps) - 10  # height of a digit
 
 
 def test_watch__without_a_file_opens_a_window_or_writes_one(

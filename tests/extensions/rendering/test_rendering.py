@@ -72,7 +72,7 @@ def test_ansi__shows_the_obstacle_and_who_cannot_act_yet() -> None:
 
 @pytest.mark.skipif(version("pillow") != "13.0.0", reason="another Pillow draws letters otherwise")
 @pytest.mark.parametrize(
-    ("scenario", "pixels"), [("paper-random-obstacle", "a7e48ead9a28"), ("cooperation-4-five", "dcca9a4d99a5")]
+    ("scenario", "pixels"), [("paper-random-obstacle", "ef6c11e4f3b1"), ("cooperation-4-five", "b9c7b2e52fc9")]
 )
 def test_pictures__have_the_same_pixels_as_ever(scenario: str, pixels: str) -> None:
     environment = EthBrakeParallelEnv(scenario, render_mode="rgb_array")

@@ -209,9 +209,8 @@ def test_page__shows_fifty_worlds_whose_counts_are_those_of_the_evaluation(html:
             said = episode["impacts"][-1][4:] if episode["impacts"] else [0, 0.0, 0.0]
             assert said == [own["impacts"][k], own["first_impact_harm"][k], own["total_harm"][k]]
             assert episode["end"] == own["end_s"][k] and episode["driven"] == [1]
-    mine = compared.result["ppo+episode"]
-    first, total = (mine[harm][k] for harm in ("first_impact_harm", "total_harm"))
-    assert world["why"] == f"ppo+episode: harm {first:.2f} first-impact, {total:.2f} total"
+    assert world["value"] == compared.result["ppo+episode"]["first_impact_harm"][k]
+    assert "World: first-impact harm of ppo+episode (m²/s²)" in html
 
 
 def at(pieces: Any, time_s: float, vehicles: int) -> Any:

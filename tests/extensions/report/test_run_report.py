@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import AGENTS
 from ethbrake_marl.episode.counts import ALL_IMPACTS, HONEST
 from ethbrake_marl.errors import EXTRA_OF
 from ethbrake_marl.evaluation.comparison import Comparison
@@ -20,7 +21,7 @@ from tests.fixtures.page import Page
 from tests.test_imports import ended
 from tests.training.tiny import TINY
 
-AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
+COMPARED = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
 
 
 # ---- the folder of a run
@@ -32,13 +33,15 @@ def test_run__leaves_results_page_and_policy(finished_run: Path) -> None:
     assert names >= {"config.json", "policy", "results.json", "worlds.csv", "report.html", *others}
     html = (finished_run / "report.html").read_text()
     assert html.count("<figure>") == html.count("data:image/svg") == 5
-    assert html.count('"pieces":') == 50 * len(AGENTS)
+    assert html.count('"pieces":') == 50 * len(COMPARED)
     page = Page(html)
     assert "ethbrake run: paper-random" in page.text and ", on paper-random: 256 steps of 256 (finished)" in page.text
     titles = [attributes.get("id") for tag, attributes in page.tags if tag == "section"]
-    assert titles[:4] == ["brake-only-test", "obstacle-test", "learning-curve", "worst-ten-worlds"]
-    assert {"agents-and-measures", "figures", "versions"} <= {*titles[4:]}
-    assert len(re.findall(r"<details><summary>\s*<h2", html)) == len(titles) - 4  # all others are folded
+    open_titles = ["brake-only-test", "obstacle-test", "learning-curve", "worst-ten-worlds"]
+    open_titles[3:3] = ["the-rule-plan"] if "plan" in AGENTS else []
+    assert titles[: len(open_titles)] == open_titles
+    assert {"agents-and-measures", "figures", "versions"} <= {*titles[len(open_titles) :]}
+    assert len(re.findall(r"<details><summary>\s*<h2", html)) == len(titles) - len(open_titles)  # others are folded
     header, main = html.split("<main")
     assert 'class="player"' in header and 'class="player"' not in main  # an episode plays before any section
     for words in (
@@ -60,6 +63,17 @@ def test_run__the_other_two_tests_stand_beside_the_main_one(finished_run: Path) 
         for agent, spec in (("full_brake", "full_brake"), ("trained policy", f"policy@{finished_run}")):
             mean = right[spec]["total_harm"].mean()
             assert saved[agent]["total_harm"] == pytest.approx(mean, rel=1e-12)
+
+
+def test_rule__stands_beside_what_was_trained(finished_run: Path) -> None:
+    pytest.importorskip("ethbrake_marl.extensions.forecasts")
+    policy = f"policy@{finished_run}"
+    result = eb.evaluate("paper-random", f"plan,{policy}", episodes=60)
+    costs = [result[agent]["honest_cost"] for agent in ("plan", policy)]
+    text = Page((finished_run / "report.html").read_text()).text
+    words = "Honest cost of the trained policy minus honest cost of the rule, mean of the first 60 worlds of the list:"
+    assert f"{words} {(costs[1] - costs[0]).mean():.2f} [" in text
+    assert f"{costs[0].mean():.2f}" in text.partition("The rule plan needs no training.")[2].partition("Worst ten")[0]
 
 
 def test_several_learners__who_bears_what_and_what_each_adds(tmp_path: Path) -> None:

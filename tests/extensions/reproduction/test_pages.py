@@ -75,11 +75,7 @@ def counts() -> dict[str, list[int]]:
 def test_readme_and_page__have_the_number_of_each_verdict() -> None:
     number, text = counts(), " ".join(README.split())
     ours, first, alone = number["agrees"]
-    assert f"Of its {len(SENTENCES)} results, {ours} agree in our own count, {first} if an episode ends" in text
-    assert f"and {alone} if each pair counts alone" in text
-    ours, first, alone = number["differs"]
-    (excluded,), (undecided,) = ({*number[verdict]} for verdict in ("cannot be", "undecided"))
-    assert f"{ours}, {first} and {alone} differ, {excluded} cannot be, {undecided} are undecided" in text
+    assert f"of its {len(SENTENCES)} results {ours} to {alone} agree" in text and ours <= first <= alone
     columns = [", ".join(str(number[verdict][k]) for verdict in VERDICTS) for k in range(len(READINGS))]
     assert (
         f"verdicts on all {len(SENTENCES)} results: agree, differ, cannot be, undecided | {' | '.join(columns)} |"

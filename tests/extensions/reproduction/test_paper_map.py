@@ -196,6 +196,8 @@ def test_mixture__has_one_physics() -> None:
 def test_honest_cost__of_exact_impacts_is_missing() -> None:
     assert "honest_cost" not in eb.evaluate(MAPPED, "coast", episodes=3, harm_count="first")["coast"]
     assert "honest_cost" in eb.evaluate(MAPPED.replace(physics=None), "coast", episodes=3)["coast"]
+    info = eb.parallel_env(MAPPED, reward={"harm_count": "total"}).reset(seed=7)[1]["vehicle_2"]
+    assert np.isnan(info["world_honest_cost"]) and info["world_total_harm"] == 0.0
     for refusing in (MAPPED.sample(1, 7).harm, MAPPED.sample(1, 7).pair_harm, MAPPED.sample(1, 7).borne_harm):
         with refused("the honest cost does not cover map"):
             refusing("honest")

@@ -32,8 +32,8 @@ MEANS = {  # harm of docs/least-harm.md, m2/s2: first-impact, total
 }  # fmt: skip
 
 COSTS = {  # honest cost of docs/results/benchmark.md, m2/s2
-    "benchmark-all": 0.299, "benchmark-blocked": 37.337, "benchmark-five": 0.436, "benchmark-noisy": 19.387,
-    "benchmark-pair": 14.246, "benchmark-truck": 17.754,
+    "benchmark-all": 0.286, "benchmark-blocked": 36.837, "benchmark-five": 0.386, "benchmark-noisy": 19.252,
+    "benchmark-pair": 14.211, "benchmark-truck": 16.483,
 }  # fmt: skip
 
 

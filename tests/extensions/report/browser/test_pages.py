@@ -1,17 +1,20 @@
 """The report in a real browser: sizes, schemes, print, keys, the player and its ledger."""
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.extensions.report.report import ReportPage
-from tests.extensions.report.browser.conftest import wait_until
 from tests.extensions.report.conftest import AGENTS, compared_by
 from tests.extensions.report.test_page import whole_page
+from tests.fixtures.browser import wait_until
 from tests.fixtures.page import HOSTILE
 
 pytestmark = pytest.mark.slow
@@ -53,14 +56,47 @@ def test_page__never_scrolls_sideways_and_is_no_giant(open_page: Open, name: str
     assert path.stat().st_size <= MOST_BYTES
 
 
-def test_first_table__shows_the_push_without_scrolling(open_page: Open, tmp_path: Path) -> None:
+CUT = """
+[...document.querySelectorAll('.top h1, .lead, .remarks li, .beside .wide, .beside :is(caption, th, td), .box, .pick')]
+  .filter((e) => e.scrollWidth > e.clientWidth + 1)
+  .map((e) => `${e.tagName} ${e.textContent.slice(0, 40)}`)
+"""
+WIDEST_WORLD = """(select => {
+  const style = getComputedStyle(select), pen = document.createElement('canvas').getContext('2d');
+  pen.font = `${style.fontWeight} ${style.fontSize} ${style.fontFamily}`;
+  return Math.max(...[...select.options].map((each) => pen.measureText(each.text).width)) +
+    parseFloat(style.paddingLeft) + parseFloat(style.paddingRight) + 16 - select.clientWidth;
+})(document.querySelector('.pick select'))"""
+
+
+def test_first_screen__cuts_nothing(open_page: Open, tmp_path: Path) -> None:
     path = tmp_path / "report.html"
-    ReportPage("t", compared_by("paper-random", "full_brake,e_v2x_bm:pairwise", 60, "honest"), "s", {}).write(path)
-    page = open_page(path.as_uri(), width=1_100)
-    for width in (2_560, 1_440, 1_100, 900):  # beside the figure, below it
+    agents = "full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo+step"
+    ReportPage("paper-random: four agents", compared_by("paper-random", agents, 60, "honest"), "s", {}).write(path)
+    page = open_page(path.as_uri())
+    for width in (360, 768, 1_152, 1_440, 2_560):
         page.set_viewport_size({"width": width, "height": 900})
-        room, needed = page.evaluate("(e => [e.clientWidth, e.scrollWidth])(document.querySelector('.beside .wide'))")
-        assert needed <= room, width
+        assert page.evaluate(CUT) == [], width
+        assert page.evaluate(WIDEST_WORLD) <= 0, width  # an option and the arrow of the list
+
+
+SMALLEST_PT = 8.0  # of the letters in our figures
+NATURAL_PX = "(e => e.getBoundingClientRect().width / e.naturalWidth)(document.querySelectorAll('figure img')[{}])"
+
+
+def test_figures__follow_the_scheme_and_can_be_read_on_a_telephone(open_page: Open, report_file: Path) -> None:
+    page = open_page(report_file.as_uri(), width=360, color_scheme="dark")
+    page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+    figures = page.locator("figure img").count()
+    assert figures >= 2
+    for k in range(figures):
+        assert page.evaluate(NATURAL_PX.format(k)) * SMALLEST_PT * 96 / 72 >= 8.99, k
+    page.emulate_media(color_scheme="light")
+    page.set_viewport_size({"width": 1_440, "height": 900})
+    light = np.asarray(Image.open(io.BytesIO(page.locator("figure img").first.screenshot())).convert("L"))
+    page.emulate_media(color_scheme="dark")
+    dark = np.asarray(Image.open(io.BytesIO(page.locator("figure img").first.screenshot())).convert("L"))
+    assert np.median(light) == 255 and np.median(dark) < 40 and dark.max() > 230  # paper and ink
 
 
 def test_pages__hostile_texts_run_nothing_and_load_nothing(open_page: Open, tmp_path: Path) -> None:
