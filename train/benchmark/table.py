@@ -323,7 +323,7 @@ def draw(cells: Cells) -> Figure:
     rows = -(-len(tasks) // 2)
     figure, panels = new_panels((9.4, 2.8 * rows), rows, 2, sharex=True)
     for axes, task in zip(panels, tasks, strict=False):
-        methods = methods_of(cells, task)[::-1]
+        methods = [method for method in methods_of(cells, task)[::-1] if shares_of(cells, task, method).value > 0.0]
         shares = [shares_of(cells, task, method) for method in methods]
         values = np.array([[share.value, *share.ends] for share in shares]).T * 100
         ends = [values[0] - values[1], values[2] - values[0]]
@@ -337,7 +337,7 @@ def draw(cells: Cells) -> Figure:
     return finish(
         figure,
         "Share of the possible reduction (%): 0 is full braking, 100 the best known. Interquartile means over seeds"
-        " with 95 % bootstrap intervals; rules have one value.",
+        " with 95 % bootstrap intervals; rules have one value. Who costs more than full braking is left out.",
     )
 
 
