@@ -222,7 +222,7 @@ def test_held_out_rows__are_of_the_lists_that_follow_from_trials_and_rows() -> N
 
 def test_methods__have_the_settings_of_their_best_trials() -> None:
     trials = [*(table.ROWS / "trials").glob("*.csv")]
-    assert len(trials) >= 7 and len({len(rows_of(file)) for file in trials}) == 1
+    assert len(trials) >= 3 and len({len(rows_of(file)) for file in trials}) == 1
     for file in trials:
         best = min(rows_of(file), key=lambda row: float(row["harm"]))
         path, function = run.METHODS[file.stem].rsplit(":", 1)
