@@ -85,9 +85,10 @@ def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str
     eb.register_objective("front", lambda harm, vehicle: harm.borne[:, 0])
     eb.register_measure("stopped_s", stopped_s, unit="s")
     driver: eb.Agent = eb.policy_agent(lambda seen: -abs(seen[:, :1]), name="mine", clip=True)
+    braking: eb.Agent = eb.policy_agent(abs, actions=eb.ActionScale(offset=-0.9, scale=0.3))
     eb.register_scenarios("my_scenarios")
     part: eb.Part = eb.Part(make_cautious, about="careful")
-    return (driver.name, *part.settings)
+    return (driver.name, braking.name, *part.settings)
 
 
 def interfaces() -> list[Any]:

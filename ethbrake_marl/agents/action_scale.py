@@ -20,8 +20,8 @@ class ActionScale(NamedTuple):
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
-    >>> eb.ActionScale(offset=-0.9, scale=0.3).actions(np.array([-1.0, 0.0, 3.0])).round(9)
-    array([-1. , -0.9,  0. ])
+    >>> eb.ActionScale(offset=-0.9, scale=0.3).actions(np.array([-1.0, 0.0, 2.0])).round(9)
+    array([-1. , -0.9, -0.3])
 
     """
 

@@ -51,8 +51,7 @@ def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, form
     Raises ``InvalidInput`` for a wrong shape or index, and for values that are not numbers. The range [-1, 1] is
     checked later, in ``Game.step``.
     """
-    scale = form if isinstance(form, ActionScale) else None
-    count = form.choices if isinstance(form, ActionScale) else form
+    scale, count = (form, form.choices) if isinstance(form, ActionScale) else (None, form)
     try:
         numbers = np.asarray(actions)
     except ValueError:  # lists of different lengths
