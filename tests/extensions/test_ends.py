@@ -12,7 +12,7 @@ from ethbrake_marl.episode.state import END
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.extensions.search.pricing import problem_of
 from tests.contract.interfaces import PAPER
-from tests.faces.test_ends import check_ends, cuts_of, last, told
+from tests.faces.test_ends import check_ends, last, taken, told
 
 NEWS = PAPER.replace(
     v2x={"preset": "nominal", "link_latency_s": 0.25, "persistence": "periodic", "tells": ["place", "speed"]}
@@ -29,7 +29,7 @@ def test_physics_of_another_kind__ends_there_too() -> None:
         )
         for each, most in ((paper_map, 4), (paper_map.replace(horizon_s=0.5 + 4 * 0.1), None))
     ]
-    assert any(cuts_of(runs[0])) and not any(cuts_of(runs[1]))
+    assert any(taken(runs[0], "cut")) and not any(taken(runs[1], "cut"))
     assert str(runs[0]) == str(runs[1])
 
 
