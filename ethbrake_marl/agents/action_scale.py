@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
@@ -40,8 +41,10 @@ ActionForm = int | ActionScale | None  # number of evenly spaced actions, a scal
 def count_in(form: ActionForm, who: str = "actions") -> int | None:
     """Number of indices, or None for numbers. Raises ``InvalidInput``, beginning with ``who``."""
     count = form.choices if isinstance(form, ActionScale) else form
-    if isinstance(form, ActionScale) and not (-1.0 <= form.offset <= 1.0 and 0.0 < form.scale < math.inf):
-        raise InvalidInput(f"{who} = {form}: the offset must be from -1 to 1, and the scale above 0")
+    if isinstance(form, ActionScale):
+        are_numbers = all(isinstance(number, Real) for number in (form.offset, form.scale))
+        if not are_numbers or not (-1.0 <= form.offset <= 1.0 and 0.0 < form.scale < math.inf):
+            raise InvalidInput(f"{who} = {form}: the offset must be a number from -1 to 1, and the scale one above 0")
     if count is not None:
         check_whole_number(who, count, 2)
     return count

@@ -109,7 +109,8 @@ def test_scale__moves_and_clips_the_numbers_and_indices_of_an_environment() -> N
     env = began(scenario="cooperation-3-pair", actions=start._replace(choices=3))
     for index, action in enumerate((-1.0, -0.9, 0.0)):
         assert env.step({"vehicle_2": index, "vehicle_3": 0})[4]["vehicle_2"]["chosen_action"] == pytest.approx(action)
-    for bad in (start._replace(scale=0.0), start._replace(offset=-1.1), start._replace(choices=1)):
+    bads: list[dict[str, Any]] = [{"scale": 0.0}, {"offset": -1.1}, {"choices": 1}, {"offset": "-0.9"}, {"scale": None}]
+    for bad in (start._replace(**each) for each in bads):
         with pytest.raises(InvalidInput, match="actions = "):
             EthBrakeParallelEnv(actions=bad)
 
