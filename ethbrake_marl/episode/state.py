@@ -215,7 +215,7 @@ class State(NamedTuple):
         """Harm that each vehicle has borne so far, [n, N] m2/s2. It sums to the harm of the line."""
         pairs, unshared, conduct = pair_amounts(self.line, self.defined(harm_count))
         out = np.empty((self.n, self.vehicles))
-        split_harm(pairs - unshared, self.car[:, MASS], out)
+        split_harm(pairs - unshared, self.car[:, MASS].copy(), out)  # one world or many: one compiled function
         return out + conduct[:, :-1]
 
     @property

@@ -1,4 +1,4 @@
-"""A table of all keys of ``v2x``: unit, meaning, and the value of each preset, from the fields and presets."""
+"""A table of all keys of ``v2x``: the value of each preset, and the meaning, from the fields and presets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from ethbrake_marl.files.model import models_in
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.worlds.channel import PRESETS, V2X
 
-UNITS = {"s": "s", "m": "m", "mps": "m/s"}  # suffix of a key -> its unit
 NO_VALUE = "–"  # the key has no effect with this preset, or no value
 
 
@@ -27,11 +26,10 @@ def key_table(v2x: V2X | None = None) -> list[list[str]]:
     presets = [name for name, settings in PRESETS.items() if "preset" not in settings]  # of this package
     channels = ([] if v2x is None else [v2x]) + [V2X.model_validate(name) for name in presets]
     all_values = [values_of(channel) for channel in channels]
-    rows = [["key", "unit", *([] if v2x is None else ["here"]), *presets, "meaning"]]
+    rows = [["key", *([] if v2x is None else ["here"]), *presets, "meaning"]]
     for key, field in _fields(V2X.key_fields()):
         cells = [_value(values, key.split(".")) for values in all_values]
-        unit = UNITS.get(key.rsplit("_", 1)[-1], "1" if field.annotation is float else NO_VALUE)
-        rows.append([key, unit, *cells, str(field.description)])
+        rows.append([key, *cells, str(field.description)])
     return rows
 
 

@@ -44,7 +44,7 @@ for one time step, usually 0.1 s. With `actions=K`, an index of K evenly spaced 
 ## Observation
 
 By default these {count} numbers, in this order. An observed number is the quantity divided by *scale*,
-clipped to *bounds*. **All numbers of a neighbour that the vehicle does not know are 0**
+clipped to *bounds*. **All numbers of a neighbour or obstacle that the vehicle does not know are 0**
 ([who knows what](../cooperation.md#who-knows-what-and-when)).
 
 {usual}
@@ -97,22 +97,11 @@ def table(headings: list[str], rows: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in (headings, ["---"] * len(headings), *rows))
 
 
-def zero_of(feature: Feature) -> str:
-    """What the number 0 says, beside the value 0."""
-    group, _, name = feature.name.rpartition(".")
-    beside = "" if group in ("", "own", "role") else ", or unknown"
-    if name.endswith("known"):
-        return "unknown, or there is none"
-    if name == "hit":
-        return "no impact so far"
-    return f"0 {feature.unit}".removesuffix(" 1") + beside
-
-
 def feature_rows(features: tuple[Feature, ...]) -> list[list[str]]:
     rows = []
     for f in features:
         meaning = f.meaning.rstrip(".").replace(", [n] s", "")
-        rows.append([f"`{f.name}`", meaning, f.unit, f"{f.scale:g}", f"{f.low:g} to {f.high:g}", zero_of(f)])
+        rows.append([f"`{f.name}`", meaning, f.unit, f"{f.scale:g}", f"{f.low:g} to {f.high:g}"])
     return rows
 
 
@@ -129,7 +118,7 @@ def more_features() -> list[list[str]]:
         count = len(eb.View([name]).features)
         forecast = "the braking of least forecast cost, and what follows" if name == "plan" else "the next impacts"
         meaning = f"[forecasts](../train.md#forecasts): {forecast}"
-        rows.append([f"`{name}`", f"{count} {meaning}", "", "", "", ""])
+        rows.append([f"`{name}`", f"{count} {meaning}", "", "", ""])
     return rows
 
 
@@ -169,8 +158,8 @@ def page() -> str:
         action=env.action_space,
         observation=f"Box({env.observation_space.shape}, {env.observation_space.dtype})",
         count=len(USUAL),
-        usual=table(["number", "meaning", "unit", "scale", "bounds", "0 means"], feature_rows(USUAL_ROWS)),
-        more=table(["number", "meaning", "unit", "scale", "bounds", "0 means"], more_features()),
+        usual=table(["number", "meaning", "unit", "scale", "bounds"], feature_rows(USUAL_ROWS)),
+        more=table(["number", "meaning", "unit", "scale", "bounds"], more_features()),
         rewards=table(["reward", "weights", "`harm_count`"], rewards),
         terms=table(["term", "value in a step", "unit"], [[f"`{n}`", m, u] for n, (u, m) in BUILT_IN.items()]),
         infos=table(["key", "meaning"], info_rows()),

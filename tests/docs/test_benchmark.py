@@ -102,7 +102,8 @@ def test_table__shows_the_middle_three_of_five_seeds_on_the_scale(tmp_path: Path
     assert second["share of the possible"].startswith("73.3 % [") and second["honest cost"].startswith("15.33 [")
     assert [row["share of the possible"] for row in (first, last, best)] == ["90.0 %", "0.0 %", "100.0 %"]
     assert best["honest cost"] == "10.00" and best.keys() == second.keys()
-    shares = {row["method"]: row["t"] for row in table.overview(cells)}
+    [rows] = table.overviews(cells)
+    shares = {row["method"]: row["t"] for row in rows}
     assert shares["m"] == second["share of the possible"] and shares["omniscient"] == "90.0 % †"
     assert shares["full braking, honest cost"] == "30.00"
     figure = tmp_path / "figure.png"
@@ -184,7 +185,7 @@ def test_improvement__is_the_share_of_pairs_that_are_better(tmp_path: Path) -> N
     cells = table.read_rows([rows_file(tmp_path / "m.csv", *rows)])
     better, last, _ = (row.get("better than the next") for row in table.table(cells))
     assert better.startswith("83.3 % [") and last == ""
-    assert [row["simulated"] for row in table.overview(cells)] == ["1", "2", "", ""]
+    assert [row["simulated"] for row in table.overviews(cells)[0]] == ["1", "2", "", ""]
 
 
 def test_rows__of_a_task_have_the_shares_of_the_shipped_table(tmp_path: Path) -> None:
@@ -242,10 +243,11 @@ def test_cross_play__has_the_means_on_and_off_the_diagonal() -> None:
 def test_tables__on_the_page_and_in_a_file_are_those_of_the_committed_rows() -> None:
     results = FOLDER.parents[1] / "docs" / "results"
     page, cells = (results / "benchmark.md").read_text("utf-8"), table.read_rows(table.ROWS.glob("*.csv"))
-    assert table.text_of(table.overview(cells)) in page
+    overviews = table.overviews(cells)
+    assert len(overviews) == 2 and all(table.text_of(rows) in page for rows in overviews)
     assert table.text_of(table.held_out(cells, (table.ROWS / "held_out").glob("*.csv"))) in page
     assert csv_text(table.table(cells)) == (results / "benchmark.csv").read_text("utf-8")
-    tables = [table.overview(cells), table.table(cells), table.differences(cells)]
+    tables = [*overviews, table.table(cells), table.differences(cells)]
     values = {value for rows in tables for row in rows for value in row.values()}
     for path, begin, end in (
         (results / "benchmark.md", "## Results\n", "\n| "),

@@ -5,13 +5,14 @@ import pickle
 import warnings
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
-import supersuit
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from gymnasium.spaces.utils import flatdim, flatten, flatten_space, unflatten
@@ -39,6 +40,8 @@ from ethbrake_marl.faces.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 from ethbrake_marl.worlds.catalogue import load_scenario
 
+supersuit: Any = import_module("supersuit") if find_spec("supersuit") else None
+needs_supersuit = pytest.mark.skipif(supersuit is None, reason="SuperSuit needs Python below 3.13")
 SETTINGS: list[dict[str, Any]] = [
     {"scenario": "paper-random-obstacle", "agents": "learners"}, {"actions": 5, "reward": "paper-reward"},
     {"scenario": "mixture-delays", "max_cycles": 7},
@@ -209,6 +212,7 @@ SUPERSUIT: list[Callable[[Any], Any]] = [
 ]  # fmt: skip  # without black_death_v3, for which an episode ends only if it is terminated and truncated
 
 
+@needs_supersuit
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_supersuit__wraps_both_forms() -> None:
     chosen = {"scenario": "cooperation-3-pair", "agents": "learners"}
@@ -224,6 +228,7 @@ def test_supersuit__wraps_both_forms() -> None:
             turns.step(None if over else turns.action_space(agent).sample())
 
 
+@needs_supersuit
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_supersuit__a_seed_repeats_the_numbers_of_skipped_frames() -> None:
     def times(seed: int) -> list[float]:

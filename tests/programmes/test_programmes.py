@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -71,13 +70,12 @@ def test_way__can_be_copied(way):
 @pytest.mark.parametrize("way", HERE)
 @pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning")
 def test_way__runs_in_the_projects_own_environment(way, tmp_path, monkeypatch):
-    if find_spec("stable_baselines3") is None:
-        pytest.skip("needs the extra train")
-    from stable_baselines3 import PPO
+    ppo = pytest.importorskip("stable_baselines3", reason="needs the extra train").PPO
+    pytest.importorskip(way.library.lower().replace("-", "_"), reason="SuperSuit needs Python below 3.13")
 
     monkeypatch.chdir(tmp_path)
-    usual = tuple(64 if value == 2048 else value for value in PPO.__init__.__defaults__)
-    monkeypatch.setattr(PPO.__init__, "__defaults__", usual)
+    usual = tuple(64 if value == 2048 else value for value in ppo.__init__.__defaults__)
+    monkeypatch.setattr(ppo.__init__, "__defaults__", usual)
     names: dict[str, object] = {}
     exec(re.sub(r"n_steps=\d+", "n_steps=32", re.sub(r"\b\d+_000\b", "64", way.code)), names)
     assert names["agent"].act is not None

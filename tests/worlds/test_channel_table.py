@@ -21,12 +21,11 @@ def test_page__has_the_table_of_the_code() -> None:
 
 def test_table__has_every_key_and_every_preset() -> None:
     head, *rows = key_table()
-    assert head == ["key", "unit", *BUILT_IN, "meaning"]
+    assert head == ["key", *BUILT_IN, "meaning"]
     table = {row[0]: dict(zip(head, row, strict=True)) for row in rows}
     assert table.keys() >= {*V2X.key_fields()} and all(row["meaning"] for row in table.values())
     assert [table["silent_links"][name] for name in BUILT_IN] == ["0", "0", "0", "0.05", "0.2", "–"]
     assert [table["loss_begins"][name] for name in BUILT_IN] == ["–", "0.01", "0.05", "0.1", "0.2", "–"]
-    assert [table[key]["unit"] for key in ("radio_s", "sensing_s", "loss_ends", "hears")] == ["s", "s", "1", "–"]
 
 
 @pytest.mark.parametrize("preset", BUILT_IN)

@@ -73,26 +73,16 @@ def train(
 
 
 def ippo(
-    task: eb.Scenario,
-    seed: int,
-    decisions: int,
-    folder: Path,
-    lr: float = 2.78e-3,
-    passes: int = 10,
-    lmbda: float = 0.9,
-) -> dict[str, Any]:
+    task: eb.Scenario, seed: int, decisions: int, folder: Path,
+    lr: float = 2.78e-3, passes: int = 10, lmbda: float = 0.9,
+) -> dict[str, Any]:  # fmt: skip
     return train("ippo", task, seed, decisions, folder, lr, passes, lmbda=lmbda, use_tanh_normal=False)
 
 
 def mappo(
-    task: eb.Scenario,
-    seed: int,
-    decisions: int,
-    folder: Path,
-    lr: float = 2.78e-3,
-    passes: int = 10,
-    lmbda: float = 0.9,
-) -> dict[str, Any]:
+    task: eb.Scenario, seed: int, decisions: int, folder: Path,
+    lr: float = 2.78e-3, passes: int = 10, lmbda: float = 0.9,
+) -> dict[str, Any]:  # fmt: skip
     return train("mappo", task, seed, decisions, folder, lr, passes, lmbda=lmbda, use_tanh_normal=False)
 
 

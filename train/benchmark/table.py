@@ -235,15 +235,24 @@ def best_known(cells: Cells, task: str) -> str:
     return f"{float(row['best_known_honest']):.2f}"
 
 
-def overview(cells: Cells) -> list[dict[str, str]]:
+def overviews(cells: Cells) -> list[list[dict[str, str]]]:
+    """Overviews of the tasks with several learners, which some methods need, of those with one, and of others."""
+    tasks, known = tasks_of(cells), group_of_scenarios(BENCHMARK)
+    several = [task for task in tasks if task in known and len(eb.load_scenario(task).learners) > 1]
+    one = [task for task in tasks if task in known and task not in several]
+    others = [task for task in tasks if task not in known]
+    return [overview(cells, group) for group in (several, one, others) if group]
+
+
+def overview(cells: Cells, tasks: list[str]) -> list[dict[str, str]]:
     """The share of each method (row) in each task (column), and the scale.
 
     First methods that simulate only their decisions, then those that simulate more, then rules; in each group the best
     in the task of most methods first.
     """
-    tasks, rows = tasks_of(cells), []
+    rows = []
     usual = max(tasks, key=lambda task: len(methods_of(cells, task)))
-    for method in dict.fromkeys(method for _, method in cells):
+    for method in dict.fromkeys(method for task, method in cells if task in tasks):
         own = [task for task in tasks if (task, method) in cells]
         factor = float(np.mean([factor_of(cells, task, method) for task in own]))
         shares = {task: shares_of(cells, task, method) for task in own}
@@ -352,7 +361,7 @@ if __name__ == "__main__":
             check_target(path, force=True)
         cells = read_rows(args.rows or ROWS.glob("*.csv"))
         figure = draw(cells) if args.figure else None
-        tables = [overview(cells), table(cells)]
+        tables = [*overviews(cells), table(cells)]
         if not args.rows:
             tables += [differences(cells), held_out(cells, (ROWS / "held_out").glob("*.csv"))]
         print("\n\n".join(text_of(rows) for rows in tables if rows))
