@@ -24,8 +24,8 @@ USUAL = eb.View().features
 USUAL_ROWS = tuple(feature for feature in USUAL if not feature.name.startswith("rear_1."))
 TEXT = """# The environment: {gymnasium}
 
-What an agent sends and receives. This page is made from the code by `python -m
-tests.docs.card`. How to use the environment: [environments](../environments.md).
+This page, made from the code by `python -m tests.docs.card`, says what an agent sends and receives. How to use
+the environment: [environments](../environments.md).
 
 | | |
 |---|---|
@@ -37,29 +37,28 @@ tests.docs.card`. How to use the environment: [environments](../environments.md)
 
 ## Action
 
-One number: -1 brakes with full capacity, 0 coasts, +1 drives with full capacity, linear on each
-side of 0. It takes effect once the vehicle's latency since the alert has elapsed, and stays in force
-for one time step, usually 0.1 s. With `actions=K`, an index of K evenly spaced numbers.
+An action is one number: -1 brakes fully, 0 coasts, +1 drives fully, linear on each side of 0. It takes effect
+once the vehicle's latency since the alert has elapsed, and stays in force for one time step, usually 0.1 s. With
+`actions=K`, it is an index of K evenly spaced numbers.
 
 ## Observation
 
-By default these {count} numbers, in this order. An observed number is the quantity divided by *scale*,
-clipped to *bounds*. **All numbers of a neighbour or obstacle that the vehicle does not know are 0**
+By default an agent observes these {count} numbers, in this order: quantities divided by *scale*, clipped to
+*bounds*. **All numbers of a neighbour or obstacle that the vehicle does not know are 0**
 ([who knows what](../cooperation.md#who-knows-what-and-when)).
 
 {usual}
 
 `rear_1`, the vehicle behind, follows with the same numbers as `front_1`, the vehicle ahead. `front_2`
-to `front_64` and `rear_2` to `rear_64` are vehicles farther away. More numbers, which
-`observation=[...]` or a scenario chooses, by name or by group:
+to `front_64` and `rear_2` to `rear_64` are vehicles farther away. `observation=[...]` or a scenario
+chooses more numbers, by name or by group:
 
 {more}
 
 ## Reward
 
-The discount of a training must be at most the reward's `shaping_discount`
-([why](../environments.md#rewards)). The reward is `r = sum weight x term`. The default is `shaped`, with
-the discount 0.99:
+The reward is `r = sum weight x term`. The discount of a training must be at most the reward's
+`shaping_discount` ([why](../environments.md#rewards)). The default is `shaped`, with the discount 0.99:
 
 {rewards}
 
@@ -78,7 +77,7 @@ options](../environments.md#episodes-and-seeds).
 
 ## Infos
 
-The same keys after a reset and after every step:
+Resets and steps return the same keys:
 
 {infos}
 
