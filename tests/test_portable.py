@@ -25,7 +25,9 @@ for module, names in ((os, {os_names!r}), (signal, {signal_names!r}), (sys, ("ab
 import ethbrake_marl.cli.app as app
 sys.exit(str([app.run_command(each) for each in {commands!r}]))
 """
-OS_NAMES = ("fork", "getuid", "geteuid", "sched_getaffinity", "mkfifo", "killpg", "getpgid", "O_NOFOLLOW", "O_NONBLOCK")
+OS_NAMES = ("fork", "getuid", "geteuid", "sched_getaffinity", "mkfifo", "killpg", "getpgid", "O_NOFOLLOW")
+if sys.version_info < (3, 14):  # from then on shutil on Unix needs it
+    OS_NAMES += ("O_NONBLOCK",)
 SIGNAL_NAMES = ("pthread_sigmask", "SIGHUP", "SIGKILL", "SIGPIPE", "SIGALRM", "setitimer", "SIGUSR1")
 
 

@@ -54,7 +54,7 @@ class Recurrent(nn.Module):
 
 def train(
     task: eb.Scenario, seed: int, decisions: int, folder: Path,
-    learning_rate: float = 1e-3, epochs: int = 10, noise: float = 1.0, harm_count: str = "honest",
+    learning_rate: float = 1.2e-3, epochs: int = 10, noise: float = 0.5, harm_count: str = "honest",
     memoryless: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Train with at most so many decisions, and save the network in `folder`."""

@@ -192,8 +192,9 @@ def test_rows__of_a_task_have_the_shares_of_the_shipped_table(tmp_path: Path) ->
     result = evaluate_task(eb.load_scenario("benchmark-pair"), "full_brake,constant:6", episodes=40)
     rows = benchmark_rows({"benchmark-pair": eb.summarise(result)}, method="")
     true = [row[table.SHARE] for row in rows]
-    (tmp_path / "a.csv").write_text(csv_text([{**row, table.SHARE: 0.5, "best_known_honest": 1.0} for row in rows]))
-    cells = table.read_rows([tmp_path / "a.csv"])
+    for best, row in enumerate(rows, 1):  # of two versions of the shipped table
+        (tmp_path / f"{best}.csv").write_text(csv_text([{**row, table.SHARE: 0.5, "best_known_honest": best}]))
+    cells = table.read_rows(tmp_path.glob("*.csv"))
     read = [float(cells["benchmark-pair", name][0][table.SHARE]) for name in ("full_brake", "constant:6")]
     assert read == pytest.approx(true) and abs(true[1]) > 0.01
 

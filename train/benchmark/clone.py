@@ -53,7 +53,7 @@ def network_of(features: int, hidden: int) -> nn.Sequential:
 
 def clone(
     task: eb.Scenario, seed: int, decisions: int, folder: Path,
-    learning_rate: float = 5.00e-4, n_epochs: int = 40, hidden: int = 256,
+    learning_rate: float = 1.06e-3, n_epochs: int = 40, hidden: int = 256,
 ) -> dict[str, Any]:  # fmt: skip
     torch.manual_seed(seed)
     seen, actions = demonstrations(task, seed, decisions)

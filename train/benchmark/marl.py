@@ -3,10 +3,9 @@
     python train/benchmark/run.py --tasks benchmark-pair --methods ippo mappo iql --output runs/benchmark
 
 IPPO: the critic of a learner has the observation of its actor. MAPPO: the critic has the state of the line. IQL: deep
-Q-learning of each learner with 9 discrete actions. The last batch is a whole one, so 200,000 decisions may be up to
-202,752. What is not the library's default stands in `experiment_of`. The defaults of `iql` are the best of its trials
-(`train/tune.py`), those of `ippo` and `mappo` are of the trials of `sb3-ppo`; both choose from a plain normal
-distribution.
+Q-learning of each learner with 9 discrete actions. IPPO and MAPPO choose from a plain normal distribution. The last
+batch is a whole one, so 200,000 decisions may be up to 202,752. What is not the library's default stands in
+`experiment_of`. The defaults of `ippo`, `mappo` and `iql` are the best of their trials (`train/tune.py`).
 """
 
 from __future__ import annotations
@@ -74,20 +73,20 @@ def train(
 
 def ippo(
     task: eb.Scenario, seed: int, decisions: int, folder: Path,
-    lr: float = 2.78e-3, passes: int = 10, lmbda: float = 0.9,
+    lr: float = 2.34e-3, passes: int = 10, lmbda: float = 0.95,
 ) -> dict[str, Any]:  # fmt: skip
     return train("ippo", task, seed, decisions, folder, lr, passes, lmbda=lmbda, use_tanh_normal=False)
 
 
 def mappo(
     task: eb.Scenario, seed: int, decisions: int, folder: Path,
-    lr: float = 2.78e-3, passes: int = 10, lmbda: float = 0.9,
+    lr: float = 1.67e-3, passes: int = 20, lmbda: float = 1.0,
 ) -> dict[str, Any]:  # fmt: skip
     return train("mappo", task, seed, decisions, folder, lr, passes, lmbda=lmbda, use_tanh_normal=False)
 
 
 def iql(
-    task: eb.Scenario, seed: int, decisions: int, folder: Path, lr: float = 1e-3, passes: int = 1, eps: float = 0.8
+    task: eb.Scenario, seed: int, decisions: int, folder: Path, lr: float = 1.82e-3, passes: int = 4, eps: float = 0.8
 ) -> dict[str, Any]:
     return train("iql", task, seed, decisions, folder, lr, passes, exploration_eps_init=eps)
 

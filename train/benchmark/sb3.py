@@ -23,7 +23,7 @@ REWARD = {"harm": 0.05, "harm_count": "honest", "shaping": 0.05, "shaping_discou
 
 def ppo(
     task: eb.Scenario, seed: int, decisions: int, folder: Path,
-    learning_rate: float = 2.78e-3, n_epochs: int = 10, gae_lambda: float = 0.9,
+    learning_rate: float = 2.32e-3, n_epochs: int = 20, gae_lambda: float = 0.9,
 ) -> dict[str, Any]:  # fmt: skip
     settings = {"learning_rate": learning_rate, "n_epochs": n_epochs, "gae_lambda": gae_lambda}
     fixed = {"n_steps": 64, "batch_size": 512, "gamma": 1.0, "seed": seed, "device": "cpu"}
@@ -32,9 +32,9 @@ def ppo(
 
 def sac(
     task: eb.Scenario, seed: int, decisions: int, folder: Path,
-    learning_rate: float = 1e-3, tau: float = 0.005, ent_coef: float = 0.05,
+    learning_rate: float = 8.19e-4, gradient_steps: int = 4, ent_coef: float = 0.01,
 ) -> dict[str, Any]:  # fmt: skip
-    settings = {"learning_rate": learning_rate, "tau": tau, "ent_coef": ent_coef}
+    settings = {"learning_rate": learning_rate, "gradient_steps": gradient_steps, "ent_coef": ent_coef}
     fixed = {"learning_starts": 2000, "gamma": 1.0, "seed": seed, "device": "cpu"}
     return finish(SAC("MlpPolicy", env_of(task, seed), **fixed, **settings), decisions, folder)
 

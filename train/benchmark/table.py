@@ -18,6 +18,7 @@ import argparse
 import csv
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from itertools import product
 from math import isfinite
 from pathlib import Path
 
@@ -63,19 +64,21 @@ def read_rows(files: Iterable[Path]) -> Cells:
     row or in `OF_A_METHOD` from the method's first row, two rows of one seed, and no rows at all.
     """
     cells: Cells = defaultdict(list)
-    tasks: dict[str, Row] = {}
     for row in (row for file in sorted(files) for row in checked_rows(file)):
-        first, cell = tasks.setdefault(row["task"], row), cells[row["task"], row["method"]]
+        cell = cells[row["task"], row["method"]]
         if any(other["seed"] == row["seed"] for other in cell):
             raise InvalidInput(f"{row['where']}: another row has the same seed; leave one of them out")
-        for name, other in [*((name, first) for name in OF_A_TASK), *((name, cell[0]) for name in OF_A_METHOD if cell)]:
-            if row[name] != other[name]:
-                raise InvalidInput(f"{row['where']}: {name} = {row[name]}, but {other[name]} in another row")
         cell.append(row)
     if not cells:
         raise InvalidInput("no rows: needs a file of run.py or of evaluate")
     for task in tasks_of(cells):
         rate(cells, task)
+    first = {task: rows[0] for (task, _), rows in reversed(cells.items())}
+    for (task, _), seeds in cells.items():
+        others = [(name, first[task]) for name in OF_A_TASK] + [(name, seeds[0]) for name in OF_A_METHOD]
+        for row, (name, other) in product(seeds, others):
+            if row[name] != other[name]:
+                raise InvalidInput(f"{row['where']}: {name} = {row[name]}, but {other[name]} in another row")
     return cells
 
 

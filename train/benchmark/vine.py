@@ -14,7 +14,7 @@ import ethbrake_marl as eb
 
 def cooperation(
     task: eb.Scenario, seed: int, decisions: int, folder: Path,
-    learning_rate: float = 5.0e-4, n_epochs: int = 4, offset: float = 0.6,
+    learning_rate: float = 1.89e-3, n_epochs: int = 4, offset: float = 0.6,
 ) -> dict[str, Any]:  # fmt: skip
     recipe = eb.load_recipe("cooperation").replace(
         learning_rate={"start": learning_rate, "end": 1e-5, "schedule": "cosine"},
