@@ -4,7 +4,7 @@
 
 IPPO: the critic of a learner has the observation of its actor. MAPPO: the critic has the state of the line. IQL: deep
 Q-learning of each learner with 9 discrete actions. IPPO and MAPPO choose from a plain normal distribution. The last
-batch is a whole one, so 200,000 decisions may be up to 202,752. What is not the library's default stands in
+batch is a whole one, so 200,000 decisions may be up to 203,840. What is not the library's default stands in
 `experiment_of`. The defaults of `ippo`, `mappo` and `iql` are the best of their trials (`train/tune.py`).
 """
 
@@ -68,7 +68,7 @@ def train(
     experiment.run()
     torch.save(experiment.group_policies[GROUP].state_dict(), folder / "policy.pt")
     (folder / "algorithm.json").write_text(json.dumps([algorithm, more]))
-    return {"start": "the task's"}
+    return {"start": "the task's", "decisions": experiment.total_frames * len(task.learners)}
 
 
 def ippo(

@@ -3,7 +3,8 @@
     python train/benchmark/run.py --tasks benchmark-pair --methods sb3-ppo sb3-sac --output runs/benchmark
 
 What is not the library's default stands here: 64 parallel worlds, updates that suit them, and no discount. The defaults
-of `ppo` and `sac` are the best of their trials (`train/tune.py`).
+of `ppo` and `sac` are the best of their trials (`train/tune.py`). The last rollout is a whole one, so 200,000 decisions
+may be up to 208,896.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def env_of(task: eb.Scenario, seed: int) -> eb.EthBrakeVecEnv:
 def finish(model: BaseAlgorithm, decisions: int, folder: Path) -> dict[str, Any]:
     model.learn(decisions)
     model.save(folder / f"{type(model).__name__.lower()}.zip")
-    return {"start": "the task's"}
+    return {"start": "the task's", "decisions": model.num_timesteps}
 
 
 def make_agent(folder: str, settings: eb.AgentSettings) -> eb.Agent:
