@@ -322,17 +322,15 @@ def open_game(
     observation: Any = None,
     reward_vector: Any = None,
     report: Sequence[str] = (),
-    threads: int | None = None,
 ) -> tuple[Scenario, Game]:
     """The scenario with these learners and observations, and its game. Arguments: see ``EthBrakeParallelEnv``.
 
-    A vehicle whose role is the name of an agent is driven by that agent. ``threads``: number of threads in a step of
-    16,384 or more worlds; None: the environment variable ``ETHBRAKE_THREADS``, or 1. The results are the same.
+    A vehicle whose role is the name of an agent is driven by that agent.
     """
     loaded = load_scenario(scenario)
     if learners is not None:
         loaded = loaded.with_learners(learners)
-    return game_of(loaded, scripts_of(loaded), reward, observation, reward_vector, report, threads)
+    return game_of(loaded, scripts_of(loaded), reward, observation, reward_vector, report)
 
 
 def require_learner(scenario: Scenario) -> None:

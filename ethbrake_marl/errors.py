@@ -114,7 +114,6 @@ EXTRA_OF = {
     **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
     **dict.fromkeys(("matplotlib", "jinja2", "markupsafe"), "report"),
     **dict.fromkeys(("benchmarl", "torchrl", "tensordict", "hydra"), "marl"),
-    "onnx": "export",
     **dict.fromkeys(("pandas", "pyarrow"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("ray", "joblib"), "cluster"),

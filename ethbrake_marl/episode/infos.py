@@ -113,38 +113,26 @@ def reward_infos(game: Game, state: State, step: Step | None) -> dict[str, Float
     return {f"reward_{name}": terms[name] for name in reported}
 
 
-def dictionaries(game: Game, state: State, step: Step | None, seed: Any, bodies: Ints) -> list[dict[str, Any]]:
-    """Infos of the ``bodies`` in all worlds: a list of dictionaries, one for each world and body, world by world.
+def arrays(game: Game, state: State, step: Step | None, seed: Any, bodies: Ints) -> dict[str, Any]:
+    """Infos of the B ``bodies`` in all worlds: name -> a new array [n * B], world by world.
 
     ``step`` is None after a reset; cost and terms are then 0. ``seed``: an int for all worlds, or [n].
     """
-    infos, vehicles = [], len(bodies)
-    seeds = [seed] * state.n if isinstance(seed, int) else seed.tolist()
-    costs = [0.0] * state.n if step is None else step.cost.tolist()
-    columns = lists_by_body(reward_infos(game, state, step) | game.extra_infos(state), bodies)
-    for k, (*values, world) in enumerate(numbers(state, bodies).reshape(OUT_ROWS, -1).T.tolist()):
-        info = named(values, int(world), costs[k // vehicles], seeds[k // vehicles])
-        for name, column in columns.items():
-            info[name] = column[k]
-        infos.append(info)
-    return infos
+    *values, world = numbers(state, bodies).reshape(OUT_ROWS, -1)
+    cost = np.zeros(state.n) if step is None else step.cost
+    seeds = np.full(state.n, seed).repeat(len(bodies))
+    infos = named(values, world.astype(np.int64), cost.repeat(len(bodies)), seeds)
+    return infos | by_body(reward_infos(game, state, step) | game.extra_infos(state), bodies)
 
 
-def lists_by_body(columns: dict[str, Any], bodies: Ints) -> dict[str, list[Any]]:
-    """Lists with a value for each world and body, world by world, from ``columns``, [n] or [n, N] each.
-
-    The columns of worlds come first, then those of vehicles.
-    """
-    lists = {name: value.repeat(len(bodies)).tolist() for name, value in columns.items() if value.ndim == 1}
-    of_vehicles = {name: value.take(bodies - 1, axis=1) for name, value in columns.items() if value.ndim == 2}
-    return lists | {name: value.reshape(-1).tolist() for name, value in of_vehicles.items()}
+def dictionaries(game: Game, state: State, step: Step | None, seed: Any, bodies: Ints) -> list[dict[str, Any]]:
+    """The same as a list of dictionaries with plain numbers, one for each world and body."""
+    columns = arrays(game, state, step, seed, bodies)
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
-def arrays(game: Game, state: State, step: Step | None, seed: Any, bodies: Ints) -> dict[str, Any]:
-    """Infos of the body in ``bodies`` [1] in all worlds: name -> a new array [n]. Arguments as in ``dictionaries``."""
-    *values, world = numbers(state, bodies)[:, :, 0]
-    cost = np.zeros(state.n) if step is None else step.cost.copy()
-    columns = named(values, world.astype(np.int64), cost, np.full(state.n, seed))
-    for name, value in (reward_infos(game, state, step) | game.extra_infos(state)).items():
-        columns[name] = (value if value.ndim == 1 else value[:, bodies[0] - 1]).copy()
-    return columns
+def by_body(columns: dict[str, Any], bodies: Ints) -> dict[str, Any]:
+    """Columns of worlds [n], then those of vehicles [n, N], as new arrays [n * B], world by world."""
+    worlds = {name: value.repeat(len(bodies)) for name, value in columns.items() if value.ndim == 1}
+    return worlds | {n: v.take(bodies - 1, axis=1).reshape(-1) for n, v in columns.items() if v.ndim == 2}

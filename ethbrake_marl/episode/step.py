@@ -23,7 +23,6 @@ from ethbrake_marl.episode.state import (
     TIME,
     State,
 )
-from ethbrake_marl.episode.threads import call_slices
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.interval import EVENT_BY_EVENT, FAILED, is_line_of_three, move_line, move_lines
@@ -64,7 +63,6 @@ class StepSettings(NamedTuple):
     terminal: float = 0.0  # weight of an end without impact in the reward
     harm_count: HarmCount = HONEST  # of harm in the reward (``episode.counts``)
     most_steps: float = np.inf  # number of steps after which an episode is truncated, at no price of motion
-    threads: int = 1  # that advance slices of many worlds at once (``episode.threads``)
 
 
 class Step(NamedTuple):
@@ -134,15 +132,11 @@ def step(
     if not donate:
         line, clock, wanted = np.empty(line.shape), np.empty(clock.shape), np.empty(wanted.shape)
 
-    def step_slice(first: int, end: int) -> tuple[int, int]:
-        rows: tuple[int, int] = step_worlds(
-            old_line, old_clock, old_wanted, not donate, first, end, line, car, clock, wanted, actions,
-            scratch_for(wanted.shape[1]), out, reward, settings.learners, settings.time_step_s, settings.harm,
-            settings.terminal, settings.harm_count.weight_array,
-        )  # fmt: skip
-        return rows
-
-    refused_row, failed_row = call_slices(step_slice, n, settings.threads)
+    refused_row, failed_row = step_worlds(
+        old_line, old_clock, old_wanted, not donate, line, car, clock, wanted, actions, scratch_for(wanted.shape[1]),
+        out, reward, settings.learners, settings.time_step_s, settings.harm, settings.terminal,
+        settings.harm_count.weight_array,
+    )  # fmt: skip
     if refused_row >= 0:
         check_actions(settings.learners, actions[refused_row])
     if failed_row >= 0:
@@ -152,10 +146,10 @@ def step(
 
 @large
 def step_worlds(
-    old_line, old_clock, old_wanted, copies, first, end, line, car, clock, wanted, actions, scratch, out, reward,
+    old_line, old_clock, old_wanted, copies, line, car, clock, wanted, actions, scratch, out, reward,
     learners, time_step_s, harm, terminal, weights,
 ):  # fmt: skip
-    """Advance the running episodes ``first`` to ``end - 1`` by one step, in place.
+    """Advance the running episodes by one step, in place.
 
     Returns the index of a refused world and of a failed world; -1 stands for none. A world is refused if an action is
     not a number in [-1, 1]; then no world of the batch has moved. It fails if a check of the physics fails. ``line``,
@@ -170,23 +164,23 @@ def step_worlds(
                 return k, -1
     if is_line_of_three(line, car, wanted, scratch):
         return -1, step_rows(
-            old_line, old_clock, old_wanted, copies, first, end, line, car, clock, wanted, actions, scratch, out,
+            old_line, old_clock, old_wanted, copies, line, car, clock, wanted, actions, scratch, out,
             reward, learners, time_step_s, harm, terminal, weights,
         )  # fmt: skip
     return -1, step_rows(
-        old_line, old_clock, old_wanted, copies, first, end, line, car, clock, wanted, actions, scratch, out, reward,
+        old_line, old_clock, old_wanted, copies, line, car, clock, wanted, actions, scratch, out, reward,
         learners, time_step_s, harm, terminal, weights,
     )  # fmt: skip
 
 
 @kernel
 def step_rows(
-    old_line, old_clock, old_wanted, copies, first, end, line, car, clock, wanted, actions, scratch, out, reward,
+    old_line, old_clock, old_wanted, copies, line, car, clock, wanted, actions, scratch, out, reward,
     learners, time_step_s, harm, terminal, weights,
 ):  # fmt: skip
     """Advance running episodes as ``step_worlds`` does; return the index of a failed world, or -1."""
     bodies, failed = wanted.shape[1], -1
-    for k in range(first, end):
+    for k in range(len(clock)):
         if copies:
             copy_world(old_line[k], old_clock[k], old_wanted[k], line[k], clock[k], wanted[k])
         for row in range(out.shape[0]):

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.action_scale import ActionForm
 from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.infos import lists_by_body
+from ethbrake_marl.episode.infos import by_body
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State, put_rows
 from ethbrake_marl.episode.step import Step
@@ -44,7 +44,6 @@ def make_sb3_vec_env(
     actions: ActionForm = None,
     report: Sequence[str] = (),
     max_cycles: int | None = None,
-    threads: int | None = None,
 ) -> EthBrakeVecEnv:
     """Environment for Stable-Baselines3 with ``n_envs`` worlds, simulated together.
 
@@ -59,14 +58,13 @@ def make_sb3_vec_env(
       ``state``.
     - ``step_infos``: return infos at every step, not only at the last one.
     - ``render_mode``: ``ansi`` or ``rgb_array``; None: no pictures.
-    - ``threads``: as in ``open_game``.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
     (4, 27)
     """
     check_whole_number("n_envs", n_envs, 1)
-    scenario_and_game = open_game(scenario, learners, reward, observation, report=report, threads=threads)
+    scenario_and_game = open_game(scenario, learners, reward, observation, report=report)
     return EthBrakeVecEnv(
         *scenario_and_game, int(n_envs), seed, horizon_is_end, appended, step_infos, render_mode, actions, max_cycles
     )
@@ -164,7 +162,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         if self.step_infos:
             infos = self._infos(stream, state, step)
         elif self.game.shield is not None:
-            lists = lists_by_body(self.game.extra_infos(state), self.bodies)
+            lists = {name: value.tolist() for name, value in by_body(self.game.extra_infos(state), self.bodies).items()}
             infos = [{name: column[k] for name, column in lists.items()} for k in range(self.num_envs)]
         else:
             infos = [{} for _ in range(self.num_envs)]

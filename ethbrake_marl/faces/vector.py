@@ -36,7 +36,6 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         autoreset_mode: Gymnasium's ``NextStep`` (the step after the last one of an episode starts the next episode,
             ignores the action and has reward 0) or ``SameStep``.
         max_episode_steps: as ``max_cycles`` in ``EthBrakeParallelEnv``.
-        threads: as in ``open_game``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -63,14 +62,13 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         actions: ActionForm = None,
         reward_vector: Any = None,
         report: Sequence[str] = (),
-        threads: int | None = None,
     ) -> None:
         check_whole_number("num_envs", num_envs, 1)
         if autoreset_mode not in ("NextStep", "SameStep", AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             raise InvalidInput(f"autoreset_mode = {autoreset_mode!r}: must be 'NextStep' or 'SameStep'")
         self.num_envs, self.autoreset_mode = int(num_envs), AutoresetMode(autoreset_mode)
         self.metadata = {**render_metadata(many=True), "autoreset_mode": self.autoreset_mode}
-        game = scenario, learners, reward, observation, reward_vector, report, threads
+        game = scenario, learners, reward, observation, reward_vector, report
         spaces = self._open_one(game, render_mode, actions, max_episode_steps)
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space, self.action_space = (batch_space(space, self.num_envs) for space in spaces)

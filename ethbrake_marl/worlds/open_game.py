@@ -16,7 +16,6 @@ from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.errors import FreeImpacts
-from ethbrake_marl.parallel import chosen_threads
 from ethbrake_marl.worlds.physics import PHYSICS
 from ethbrake_marl.worlds.sampling import WorldPool
 from ethbrake_marl.worlds.scenario import Scenario
@@ -31,7 +30,6 @@ def game_of(
     observation: Any = None,
     reward_vector: Any = None,
     report: Sequence[str] = (),
-    threads: int | None = None,
 ) -> tuple[Scenario, Game]:
     """The scenario with this ``observation``, and its game.
 
@@ -50,7 +48,6 @@ def game_of(
         reward, scenario.objective, scenario.vehicles, bodies, (scenario.time_step_s, scenario.horizon_s),
         reward_vector, report,
     )  # fmt: skip
-    settings = settings._replace(threads=chosen_threads(threads))
     if rewarding.params.harm:
         _warn_of_ties(scenario, rewarding.params.objective or scenario.objective)
     views = (View(), *views_of(scenario))

@@ -5,13 +5,6 @@ from typing import TYPE_CHECKING
 from ethbrake_marl.lazy_imports import front_door
 
 if TYPE_CHECKING:
-    from ethbrake_marl.extensions.cooperation.front import (
-        Front as Front,
-        corners as corners,
-        least_largest as least_largest,
-        search_front as search_front,
-        weight_grid as weight_grid,
-    )
     from ethbrake_marl.extensions.cooperation.seeds import (
         mean_over_seeds as mean_over_seeds,
         share_over_seeds as share_over_seeds,

@@ -17,8 +17,6 @@ from ethbrake_marl.episode.step import hold_commands
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.proofs.avoidability import FRONT, avoidability
 from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, least_contact_harm
-from ethbrake_marl.extensions.proofs.chain_search import BOXES, chain_bound
-from ethbrake_marl.extensions.proofs.chains import BOX_ROWS
 from ethbrake_marl.extensions.proofs.first_contacts import GRAZE_S, last_meeting, outer_contact, rear_times
 from ethbrake_marl.extensions.proofs.followers import after
 from ethbrake_marl.extensions.proofs.line import (
@@ -210,7 +208,7 @@ def combined_bound(at, until, front, rear, cells):
 
 
 @large
-def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, boxes, memory, out):
+def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
     """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2): front pair, rear pair, both together.
 
     ``rows`` [n, LINE_COLUMNS]: the worlds (columns: ``proofs/line.py``). Harm after ``until`` [n] (s) does not count.
@@ -230,8 +228,6 @@ def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, boxes, me
             out[k, REAR_BOUND] = squared if time < until[k] and squared > TOUCH_HARM else 0.0
         if unavoidable[k]:
             out[k, COMBINED_BOUND] = combined_bound(rows[k], until[k], out[k, FRONT_BOUND], out[k, REAR_BOUND], cells)
-        if unavoidable[k] and boxes.shape[1] > 0 and last_rest(rows[k]) < until[k]:
-            out[k, COMBINED_BOUND] = max(out[k, COMBINED_BOUND], chain_bound(rows[k], until[k], boxes, memory))
 
 
 def lower_bound(
@@ -268,7 +264,6 @@ def lower_bound(
     start = state.time_s + rows_of(state, body)[:, ONSET_F]
     count = HarmCount.of(harm_count, "lower_bound: harm_count")
     _check_asked(state, start, count, horizon_s, time_step_s)
-    columns = BOXES if count == HONEST and time_step_s is not None else 0
     count = ALL_IMPACTS if count == HONEST else count
     full = np.pad(-state.braking_capacity_mps2, ((0, 0), (1, 0)))
     now = hold_commands(state._replace(wanted=full), start)  # until then all brake fully
@@ -281,10 +276,8 @@ def lower_bound(
 
     def bound(first: int) -> None:
         part = slice(first, first + _AT_ONCE)
-        cells, boxes, memory = np.empty((CELLS, CELL_COLUMNS)), np.empty((BOX_ROWS, columns)), np.empty((2, BOX_ROWS))
-        bound_worlds(
-            rows[part], until[part], has_front[part], has_rear[part], unavoidable[part], cells, boxes, memory, out[part]
-        )
+        cells = np.empty((CELLS, CELL_COLUMNS))
+        bound_worlds(rows[part], until[part], has_front[part], has_rear[part], unavoidable[part], cells, out[part])
 
     with ThreadPoolExecutor(chosen_threads(None)) as pool:
         list(pool.map(bound, range(0, state.n, _AT_ONCE)))

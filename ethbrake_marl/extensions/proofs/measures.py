@@ -1,4 +1,4 @@
-"""The measures ``avoidable``, ``proven_harm`` and ``proven_cost``: what the proofs say of each world.
+"""The measures ``avoidable`` and ``proven_harm``: what the proofs say of each world.
 
 They are computed only on request, because a proof is slow.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST, HarmCount
+from ethbrake_marl.episode.counts import FIRST_IMPACTS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -29,7 +29,7 @@ def avoidable(game: Game, alert: State, last: State) -> MeasureValue:
     return {"": verdict.avoidable, "reason": verdict.reason_name}
 
 
-_bound_cache: dict[HarmCount, tuple[bytes, LowerBound]] = {}  # count -> worlds of the last request, and their bounds
+_bound_cache: list[tuple[bytes, LowerBound]] = []  # worlds of the last request, and their bounds
 
 
 def proven_harm(game: Game, alert: State, last: State) -> MeasureValue:
@@ -37,29 +37,21 @@ def proven_harm(game: Game, alert: State, last: State) -> MeasureValue:
 
     ``impact``: whether the bound is above 0. The result is the same for every agent.
     """
-    bound = _bound(game, alert, FIRST_IMPACTS)
+    bound = _bound(game, alert)
     return {"": bound.harm, "impact": bound.impact_proven}
 
 
-def proven_cost(game: Game, alert: State, last: State) -> MeasureValue:
-    """Lower bound on the honest cost, whatever the controlled vehicle commands at its decisions, [n] m2/s2.
-
-    The result is the same for every agent.
-    """
-    return {"": _bound(game, alert, HONEST).harm}
-
-
-def _bound(game: Game, alert: State, count: HarmCount) -> LowerBound:
+def _bound(game: Game, alert: State) -> LowerBound:
     body, settings = _controlled_body(game, alert), game.settings
     ends = np.array([body, settings.horizon_s, settings.time_step_s])
     departures = " ".join(sorted(alert.departures)).encode()  # a stored bound must not pass worlds that are refused
     request = departures + ends.tobytes() + alert.line.tobytes() + alert.car.tobytes()
-    if request != _bound_cache.get(count, (b"",))[0]:
+    if not _bound_cache or request != _bound_cache[0][0]:
         bound = lower_bound(
-            alert, body, harm_count=count, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s
+            alert, body, harm_count=FIRST_IMPACTS, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s
         )
-        _bound_cache[count] = request, bound
-    return _bound_cache[count][1]
+        _bound_cache[:] = [(request, bound)]
+    return _bound_cache[0][1]
 
 
 def _controlled_body(game: Game, alert: State, *, together: bool = False) -> int:
@@ -71,13 +63,11 @@ def _controlled_body(game: Game, alert: State, *, together: bool = False) -> int
     scripted_bodies = [body for body in range(1, alert.vehicles + 1) if body not in learners]
     if game.scripts or (alert.wanted[:, scripted_bodies] != -capacities(alert.car, BRAKING)[:, scripted_bodies]).any():
         raise InvalidInput(
-            "avoidable, proven_harm, proven_cost: a vehicle that does not learn does not brake fully; all others must"
+            "avoidable, proven_harm: a vehicle that does not learn does not brake fully; all others must"
         )
     if len(learners) != 1 and not (together and learners == [2, 3]):
         names = ", ".join(f"vehicle_{body}" for body in learners)
-        raise InvalidInput(
-            f"avoidable, proven_harm, proven_cost: {names} learn; the proofs cover one controlled vehicle"
-        )
+        raise InvalidInput(f"avoidable, proven_harm: {names} learn; the proofs cover one controlled vehicle")
     return int(learners[0])
 
 
@@ -89,6 +79,3 @@ PROVEN_HARM = Part(
         Statistic("impact_proven_rate", "rate", "Impact proven", "Impact\nproven", "impact"),
     ),
 )  # fmt: skip
-PROVEN_COST = Part(
-    proven_cost, unit="m2/s2", statistics=(Statistic("proven_cost", "mean", "Proven cost", "Proven\ncost"),)
-)

@@ -320,8 +320,8 @@ def test_measures__are_asked_for_by_name():
     near = eb.evaluate(soon, "full_brake", episodes=6, measures="proven_harm")["full_brake"]["proven_harm"]
     assert near.sum() < 0.8 * sum(RECORDED["paper-random"][2])
     coasts = eb.load_scenario("paper-random").replace(roles={"vehicle_2": "learner", "vehicle_3": "coast"})
-    with refused("avoidable, proven_harm, proven_cost: a vehicle that does not learn does not brake fully"):
+    with refused("avoidable, proven_harm: a vehicle that does not learn does not brake fully"):
         eb.evaluate(coasts, "full_brake", episodes=2, measures="avoidable")
     both = eb.load_scenario("paper-random").with_learners(["vehicle_2", "vehicle_3"])
-    with refused("avoidable, proven_harm, proven_cost: vehicle_2, vehicle_3 learn; the proofs cover one controlled"):
+    with refused("avoidable, proven_harm: vehicle_2, vehicle_3 learn; the proofs cover one controlled"):
         eb.evaluate(both, "full_brake", episodes=2, measures="proven_harm")
