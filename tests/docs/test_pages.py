@@ -11,7 +11,7 @@ from tests.docs.printed import PAGES, ROOT
 WITH_BLOCKS = [page for page in PAGES if blocks(page)]
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning:minari")
+@pytest.mark.filterwarnings("ignore::UserWarning:minari", "ignore::FutureWarning:copyreg")
 @pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_page__its_blocks_run_and_print_what_it_shows(
     page: Path, empty_folder: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest

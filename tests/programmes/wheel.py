@@ -76,7 +76,6 @@ COMMANDS = (
     Call(("ethbrake", "doctor")),
     Call(("ethbrake", "train", "--steps", "1000"), 2, NEEDS_TRAIN),
     Call(("ethbrake", "run"), 2, NEEDS_TRAIN),
-    Call(("ethbrake", "agent", "export", "ppo", "--onnx", "ppo.onnx"), 2, "'ethbrake-marl[export]'"),
     Call(("python", "-c", "import ethbrake_marl as eb; eb.train"), 1, NEEDS_TRAIN),  # an exception ends with it
 )
 SMOKE = (COMMANDS[0], COMMANDS[1], COMMANDS[6], COMMANDS[7])  # for the sdist, which has the same files as the wheel
