@@ -5,6 +5,7 @@ import os
 import pytest
 
 from ethbrake_marl import parallel
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.parallel import WorkerLost, run_each
 
 
@@ -26,6 +27,26 @@ def test_process__that_is_killed_is_an_error_and_each_has_one_thread() -> None:
     assert [*run_each(((os.getenv, "OMP_NUM_THREADS") for _ in range(3)), 2)] == ["1"] * 3
     with pytest.raises(WorkerLost, match="use fewer processes"):
         list(run_each([(os._exit, 3)], 2))
+
+
+def test_chosen_threads__are_those_of_the_argument_or_of_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "usable_cores", lambda: 8)
+    assert parallel.chosen_threads(None) == 1
+    monkeypatch.setenv("ETHBRAKE_THREADS", "3")
+    assert [parallel.chosen_threads(threads) for threads in (None, 2, 64)] == [3, 2, 8]
+
+
+@pytest.mark.parametrize("text", ["", "0", "1.5"])
+def test_chosen_threads__refuses_a_bad_variable(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ETHBRAKE_THREADS", text)
+    with pytest.raises(InvalidInput, match=rf"^ETHBRAKE_THREADS = '{text}': must be a whole number from 1 to 1024$"):
+        parallel.chosen_threads(None)
+
+
+@pytest.mark.parametrize("threads", [0, True])
+def test_chosen_threads__refuses_a_bad_number(threads: object) -> None:
+    with pytest.raises(InvalidInput, match=r"^threads = .*: must be a whole number in 1..1024$"):
+        parallel.chosen_threads(threads)
 
 
 @pytest.mark.parametrize(("cores", "jobs", "processes", "share"), [(5, 2, 2, 2), (3, 8, 3, 1), (2, 2, 2, 1)])

@@ -135,4 +135,5 @@ def dictionaries(game: Game, state: State, step: Step | None, seed: Any, bodies:
 def by_body(columns: dict[str, Any], bodies: Ints) -> dict[str, Any]:
     """Columns of worlds [n], then those of vehicles [n, N], as new arrays [n * B], world by world."""
     worlds = {name: value.repeat(len(bodies)) for name, value in columns.items() if value.ndim == 1}
-    return worlds | {n: v.take(bodies - 1, axis=1).reshape(-1) for n, v in columns.items() if v.ndim == 2}
+    of_vehicles = {name: value.take(bodies - 1, axis=1) for name, value in columns.items() if value.ndim == 2}
+    return worlds | {name: value.reshape(-1) for name, value in of_vehicles.items()}

@@ -16,7 +16,7 @@ from ethbrake_marl.episode.hold import choose, descend, hold
 from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
-from ethbrake_marl.motion.layout import BRAKING
+from ethbrake_marl.motion.layout import BRAKING, scratch_for
 
 N = 7
 REWARDS: dict[str, Any] = {
@@ -94,6 +94,15 @@ def test_put__replaces_these_rows_and_no_others(game: Game, rows: Any) -> None:
     assert bits(state) == before
     owned = copy.deepcopy(state)
     assert bits(owned.put(rows, new, donate=True)) == bits(placed) == bits(owned)
+
+
+def test_step__of_three_vehicles_has_the_bits_of_the_text_for_any_number(
+    game: Game, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = middle(game)
+    with_constants = after(game, state)
+    monkeypatch.setattr("ethbrake_marl.episode.step.scratch_for", lambda bodies: scratch_for(bodies + 1))
+    assert after(game, state) == with_constants
 
 
 def test_episode__that_has_ended_stays_and_pays_nothing(game: Game) -> None:
