@@ -10,7 +10,6 @@ CONTENTS = {
         "ppo": "agents.trained:PPO",
         "sac": "agents.trained:SAC",
         "vine-paper": "agents.trained:VINE_PAPER",
-        "vine-preference": "agents.trained:VINE_PREFERENCE",
         "e_v2x_bm": "agents.e_v2x_bm:E_V2X_BM",
         "ladder": "agents.scripts:LADDER",
     },

@@ -64,4 +64,3 @@ POLICY = Part(
 )
 TEAM = Part(make_trained, form="team@RUN", about="the learners of a run, each with its policy", knows=MESSAGES)
 VINE_PAPER = _shipped("vine-paper", "paper-random, first-impact harm: it pushes")
-VINE_PREFERENCE = _shipped("vine-preference", "paper-random-preference")

@@ -29,7 +29,6 @@ from ethbrake_marl.motion.layout import (
     RESTITUTION,
     SCRIPTED,
     SPEED,
-    WEIGHT,
     Bools,
     Floats,
 )
@@ -44,7 +43,7 @@ SHOWN = frozenset({BUILD_UP, OBSTACLE, BACKWARD})  # departures that the arrays 
 
 # Rows of `car` that every feature takes into account, in the order in which digests hash them. Any other row departs
 # where it is not 0; but SCRIPTED belongs to the game, not to its worlds.
-PLAIN_ROWS = [MASS, LIMIT, LATENCY, BRAKING, DRIVING, BRAKE_RATE, RELEASE_RATE, WEIGHT, RESTITUTION, OWN_LATENCY]
+PLAIN_ROWS = [MASS, LIMIT, LATENCY, BRAKING, DRIVING, BRAKE_RATE, RELEASE_RATE, RESTITUTION, OWN_LATENCY]
 
 
 def departures_of(physics: Any) -> frozenset[str]:

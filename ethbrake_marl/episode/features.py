@@ -15,7 +15,7 @@ import numpy as np
 from ethbrake_marl.episode.functions import description_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.motion.layout import BRAKE_RATE, RELEASE_RATE, WEIGHT, Floats, Ints
+from ethbrake_marl.motion.layout import BRAKE_RATE, RELEASE_RATE, Floats, Ints
 from ethbrake_marl.registry import Registry
 
 MOST_NEIGHBOURS = 64  # on each side
@@ -100,10 +100,6 @@ def _build_up_s(state: State, body: int) -> Floats:
 
 def _release_s(state: State, body: int) -> Floats:
     return state.braking_capacity_mps2[:, body - 1] / state.car[:, RELEASE_RATE, body]
-
-
-def _weight_share(state: State, body: int) -> Floats:
-    return state.car[:, WEIGHT, body] / state.car[:, WEIGHT, 1:].sum(axis=1)
 
 
 def _own_and_neighbour(
@@ -204,9 +200,6 @@ FEATURES: Registry[ComputedFeature] = Registry(
             "build_up_time", "s", 4.0, _build_up_s, "time until brakes are fully applied; 0 if at once"
         ),
         **_own_and_neighbour("release_time", "s", 4.0, _release_s, "time until full brakes are released; 0 if at once"),
-        **_own_and_neighbour(
-            "harm_weight", "1", 1.0, _weight_share, "share in the weights of harm (objective: preference)"
-        ),
     },
 )
 GROUPS: Registry[Group] = Registry("group of features", "feature_groups", register_feature_group)

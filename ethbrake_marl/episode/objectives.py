@@ -11,7 +11,6 @@ social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``: social value orientat
 maximin             ``max_j H_j``
 mass-weighted       ``N sum_j m_j H_j / sum_j m_j``
 weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``, one weight per vehicle, 0 or from 1e-6 to 1e6
-preference          as ``weighted``, with the weights ``harm_weight`` of the scenario
 first:A,then:B      ``1000 A + B`` for two other objectives: nearly their lexicographic order
 ==================  ================================================================================================
 
@@ -39,7 +38,7 @@ from ethbrake_marl.episode.functions import call_function, description_of
 from ethbrake_marl.episode.state import State, split_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.motion.layout import CAR_ROWS, MASS, WEIGHT, Floats
+from ethbrake_marl.motion.layout import CAR_ROWS, MASS, Floats
 from ethbrake_marl.registry import Registry
 
 Declared = str | Sequence[str]  # one objective for all vehicles, or one for each
@@ -345,11 +344,6 @@ OBJECTIVES: Registry[Kind] = Registry(
             "weighted:W1,W2,...", "harm of all vehicles, with one given weight per vehicle",
             lambda harm, i, written: harm.weighted(np.full(harm.borne.shape, written.numbers)),
             lambda car, i, written: _shares(np.array([written.numbers])),
-        ),
-        "preference": Kind(
-            "preference", "harm of all vehicles, with the weights harm_weight of the scenario",
-            lambda harm, i, written: harm.weighted(harm.car[:, WEIGHT, 1:]),
-            lambda car, i, written: _shares(car[:, WEIGHT, 1:]),
         ),
         "vehicle_K": Kind(
             "vehicle_K", "harm that Vehicle K bears",

@@ -14,7 +14,19 @@ import numpy as np
 from ethbrake_marl.episode.departures import PLAIN_ROWS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.files.python_file import files_run
-from ethbrake_marl.motion.layout import CAR_NAMES, FIRST, FORCE, GAP, HIT, IMPACTS, SCRIPTED, SPEED, TOTAL
+from ethbrake_marl.motion.layout import (
+    CAR_NAMES,
+    FIRST,
+    FORCE,
+    GAP,
+    HIT,
+    IMPACTS,
+    RESTITUTION,
+    SCRIPTED,
+    SPEED,
+    TOTAL,
+    Floats,
+)
 from ethbrake_marl.registry import versions_used
 
 EVALUATION_PACKAGES = ("ethbrake-marl", "numba", "numpy")
@@ -24,11 +36,11 @@ KEYS_WITHOUT_EFFECT = ("name", "title", "description", "source")  # keys of a sc
 
 
 def worlds_sha256(worlds: State) -> str:
-    """SHA-256 of worlds at the alert: of the quantities ``MOTION`` and ``PLAIN_ROWS``, of ``know`` and of ``wanted``.
+    """SHA-256 of worlds at the alert: of the quantities ``MOTION`` and ``plain_car``, of ``know`` and of ``wanted``.
 
     Numbers are little-endian floats. Another quantity of vehicles (row of ``car``) is hashed with its name, unless 0.
     """
-    digest, arrays = hashlib.sha256(), [worlds.line[:, MOTION], worlds.car[:, PLAIN_ROWS], worlds.know, worlds.wanted]
+    digest, arrays = hashlib.sha256(), [worlds.line[:, MOTION], plain_car(worlds), worlds.know, worlds.wanted]
     for name in sorted(CAR_NAMES):
         further = worlds.car[:, CAR_NAMES.index(name)]
         if CAR_NAMES.index(name) not in (*PLAIN_ROWS, SCRIPTED) and further.any():
@@ -38,6 +50,12 @@ def worlds_sha256(worlds: State) -> str:
         digest.update(f"{array.shape}".encode())
         digest.update(np.ascontiguousarray(array, "<f8").data)
     return digest.hexdigest()
+
+
+def plain_car(worlds: State) -> Floats:
+    """``PLAIN_ROWS`` of the parameters, and a row of 1 for each vehicle, which published digests contain."""
+    is_vehicle = np.arange(worlds.vehicles + 1) > 0
+    return np.insert(worlds.car[:, PLAIN_ROWS], PLAIN_ROWS.index(RESTITUTION), is_vehicle, axis=1)
 
 
 def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:

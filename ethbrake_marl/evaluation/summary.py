@@ -39,7 +39,6 @@ SYMBOLS = {
     "driving_capacity_mps2": ("driving capacity", "m/s²"), "latency_s": ("τ", "s"), "mass_t": ("m", "t"),
     "restitution": ("e", ""), "obstacle_gap_m": ("obstacle at", "m"), "friction": ("friction", ""),
     "brake_rate_mps3": ("brake rate", "m/s³"), "release_rate_mps3": ("release rate", "m/s³"),
-    "harm_weight": ("weight of harm", ""),
 }  # fmt: skip
 STAY = "\u00a0"  # a space at which no line ends
 

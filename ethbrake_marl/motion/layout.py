@@ -4,9 +4,9 @@ Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, f
 In a row of pairs, column p is the pair (body p, body p + 1). Column 0 exists in every world: without an obstacle its
 gap is ``FAR_M``, and the physics leaves it out.
 
-Arrays that most functions share: ``line`` [13, N + 1] changes, ``car`` [11, N + 1] stays the same, ``scratch`` [38, N +
+Arrays that most functions share: ``line`` [13, N + 1] changes, ``car`` [10, N + 1] stays the same, ``scratch`` [38, N +
 1] is the working memory of one call. A batch of n worlds has one more axis in front: ``line`` [n, 13, N + 1], ``car``
-[n, 11, N + 1].
+[n, 10, N + 1].
 """
 
 from __future__ import annotations
@@ -42,13 +42,12 @@ BRAKING = 3  # largest deceleration on this road (m/s2)
 DRIVING = 4  # largest acceleration forward on this road (m/s2)
 BRAKE_RATE = 5  # rate at which the force falls towards the command (m/s3); infinite: at once
 RELEASE_RATE = 6  # rate at which the force rises towards the command (m/s3); infinite: at once
-WEIGHT = 7  # weight of the vehicle's harm in the objective `preference`
-RESTITUTION = 8  # of every impact of the world, in all columns (1)
-OWN_LATENCY = 9  # latency without the wait for news of the alert (s)
-SCRIPTED = 10  # 1: a script drives the vehicle in this game (`Game.marked`)
+RESTITUTION = 7  # of every impact of the world, in all columns (1)
+OWN_LATENCY = 8  # latency without the wait for news of the alert (s)
+SCRIPTED = 9  # 1: a script drives the vehicle in this game (`Game.marked`)
 CAR_NAMES = (
     *("mass", "speed limit", "latency", "braking capacity", "driving capacity"),
-    *("brake rate", "release rate", "harm weight", "restitution", "own latency", "scripted"),
+    *("brake rate", "release rate", "restitution", "own latency", "scripted"),
 )  # of these rows, in their order
 CAR_ROWS = len(CAR_NAMES)
 

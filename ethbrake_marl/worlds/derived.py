@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario
 
 GRAVITY_MPS2 = 9.81
-LEAST_WEIGHT = 1e-6  # least weight of harm that one vehicle of a line must have, so that shares of weights are exact
 
 QuantityValues = dict[str, Floats]  # key of a quantity -> values in k worlds, [k, vehicles, pairs or 1]
 
@@ -89,7 +88,3 @@ def mistakes(scenario: Scenario, low: QuantityValues, high: QuantityValues) -> I
         for row in first(low[key][:, i] >= abs(deceleration)):
             right = f"must be at least {abs(deceleration):g} m/s2 on the road, because roles.{name} = {role}"
             yield key, i, row, right
-    if "harm_weight" in low:
-        for row in first((low["harm_weight"] >= LEAST_WEIGHT).any(axis=1)):
-            right = f"at least one vehicle must always have a weight of {LEAST_WEIGHT:g} or more"
-            yield "harm_weight", 0, row, right

@@ -41,10 +41,7 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
     is_present = {
         key: np.isfinite(values[key]).any() for key in ("obstacle_gap_m", "brake_rate_mps3", "release_rate_mps3")
     }
-    is_present |= {
-        "harm_weight": (values["harm_weight"] != 1.0).any(),
-        "friction": np.isfinite(values["friction"]).all(),
-    }
+    is_present["friction"] = np.isfinite(values["friction"]).all()
     return {
         QUANTITIES[key].column_of(i): np.minimum(column, QUANTITIES[key].high)
         for key in QUANTITIES

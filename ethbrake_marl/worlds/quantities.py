@@ -6,17 +6,7 @@ from typing import Any, NamedTuple
 
 from ethbrake_marl.files.model import UNITS, UNSHOWN, require
 from ethbrake_marl.files.yaml import YamlPath
-from ethbrake_marl.motion.layout import (
-    BRAKE_RATE,
-    BRAKING,
-    DRIVING,
-    LATENCY,
-    LIMIT,
-    MASS,
-    RELEASE_RATE,
-    RESTITUTION,
-    WEIGHT,
-)
+from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, DRIVING, LATENCY, LIMIT, MASS, RELEASE_RATE, RESTITUTION
 from ethbrake_marl.worlds.quantity import DISTRIBUTIONS, support
 
 # A stream is an independent sequence of uniform random numbers, named by a tuple.
@@ -26,7 +16,7 @@ OBSTACLE_STREAM = (2,)
 TYPES = (3,)  # types and loads of the vehicles
 MIXTURE = (4,)  # scenario of a mixture
 SURROUNDINGS = (6,)  # friction, row of the table, time before the alert
-BRAKES = (7,)  # brake rates, release rates, weights of harm
+BRAKES = (7,)  # brake rates, release rates
 GENERATORS = (8,)  # key of the random generators of scripts
 
 NUMBERS_PER_VEHICLE = 8  # numbers of one vehicle in the streams MAIN and BRAKES
@@ -175,11 +165,6 @@ _OPTIONAL = (
         "rate at which the deceleration of each vehicle falls, and its forward acceleration builds up; without this"
         " key both change at once", "25", "release_rate_{}_mps3", stream=BRAKES,
     ),
-    Rule(
-        "harm_weight", "", "vehicle", 1e6, False, 2,
-        "weight of the harm that each vehicle bears, for objective: preference; 1 without this key", "[1, 4, 1]",
-        "harm_weight_{}", stream=BRAKES,
-    ),
 )  # fmt: skip
 
 QUANTITIES = {rule.key: rule for rule in (*_USUAL, *_SUBSTITUTES, *_OPTIONAL)}
@@ -197,7 +182,6 @@ CAR_QUANTITIES = {
     "driving_capacity_mps2": DRIVING,
     "brake_rate_mps3": BRAKE_RATE,
     "release_rate_mps3": RELEASE_RATE,
-    "harm_weight": WEIGHT,
     "restitution": RESTITUTION,
 }  # rows of `State.car`
 

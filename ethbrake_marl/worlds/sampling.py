@@ -171,7 +171,7 @@ def state_of(scenario: Scenario, quantities: QuantityValues, numbers: Numbers, u
         line[rows, layout.SPEED, 1:], line[rows, GAP, 0] = quantities["speeds_mps"][rows], obstacle[rows, 0]
         line[rows, GAP, 1:N], line[rows, GAP, N] = quantities["gaps_m"][rows], np.inf
         car[rows, layout.MASS, 0] = car[rows, BRAKE_RATE] = car[rows, layout.RELEASE_RATE] = np.inf
-        car[rows, layout.RESTITUTION, 0], car[rows, layout.WEIGHT, 1:] = quantities["restitution"][rows, 0], 1.0
+        car[rows, layout.RESTITUTION, 0] = quantities["restitution"][rows, 0]
         for row, values in of_car:
             car[rows, row, 1:] = values[rows]
         know[rows, 1:, 1:] = reaction_time[rows]

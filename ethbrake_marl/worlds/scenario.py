@@ -141,7 +141,6 @@ class Scenario(ScenarioPart):
     friction: Quantity | None = _quantity("friction", exclude_if=not_)
     brake_rate_mps3: PerVehicle | None = _quantity("brake_rate_mps3", exclude_if=not_)
     release_rate_mps3: PerVehicle | None = _quantity("release_rate_mps3", exclude_if=not_)
-    harm_weight: PerVehicle | None = _quantity("harm_weight", exclude_if=not_)
     alert_s: Quantity | None = _quantity("alert_s", exclude_if=not_)
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="keep or reject worlds with an impact at or before the first decision of a learner"

@@ -58,17 +58,16 @@ NO_CODE = ("text", "bibtex")
 TINY = "--steps 1 --set evaluation.worlds=10 --set n_envs=16 --set tried=16"
 SHORT = {  # what is added to a command, the first that fits: the last value of an option counts
     "ethbrake train --recipe three-tests": TINY,
-    "ethbrake train --recipe preference": TINY,
     "ethbrake train": "--steps 1 --set evaluation.worlds=10",
     "ethbrake run": "--steps 1 --set evaluation.worlds=10 --episodes 20",
     "ethbrake evaluate": "--episodes 20",
     "ethbrake reproduce": "--list",
     "ethbrake study ablate": "--steps 1 --episodes 4 --search-episodes 2 --seeds 1",
-    "ethbrake study front": "--episodes 2 --steps 1 --budget 20",
     "python train/ippo.py": "--steps 200 --copies 2 --rollout 60",
     "python train/benchmark/run.py": "--seeds 1 --jobs 1 --decisions 100 --episodes 5",
     "python train/tune.py": "--trials 1 --jobs 1 --set total_steps=1 evaluation.worlds=10",
     "python docs/studies/best_harm.py": "--episodes 2 --budget 20",
+    "python docs/studies/whose_harm.py": "--worlds 2 --budget 20",
 }
 
 

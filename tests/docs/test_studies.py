@@ -54,31 +54,6 @@ def test_restamp__renews_a_table_only_if_all_its_harms_keep_their_bits(tmp_path,
     assert other_worlds.endswith("NOT renewed: its worlds are not those of its list")
 
 
-def volume_below(reference: np.ndarray, points: np.ndarray) -> float:
-    """The volume that points [n, 3] dominate below a reference point, cell by cell of the grid of their coordinates."""
-    edges = [np.unique(np.clip([*points[:, k], reference[k]], None, reference[k])) for k in range(3)]
-    corners = np.stack(np.meshgrid(*(edge[:-1] for edge in edges), indexing="ij"), axis=-1)
-    dominated = (points[:, None, None, None] <= corners).all(axis=-1).any(axis=0)
-    return float(np.einsum("ijk,i,j,k", dominated, *map(np.diff, edges)))
-
-
-def test_morl_front__its_numbers_agree_with_each_other_and_with_full_braking() -> None:
-    found = json.loads((DOCS / "studies" / "morl_front.json").read_bytes())
-    weights = np.array(found["weights"])
-    assert weights.shape == (21, 3) and np.allclose(weights.sum(axis=1), 1.0)
-    braking = eb.evaluate(found["scenario"], "full_brake", episodes=found["worlds"], seed=found["seed"])["full_brake"]
-    columns = {"first": "first_impact_harm", "total": "total_harm"}
-    for training in found["trainings"]:
-        for count, column in columns.items():
-            measured = training[count]
-            full = np.array([braking[f"{column}_{vehicle}"].mean() for vehicle in (1, 2, 3)])
-            points = np.array(measured["harm"])
-            assert points.shape == (21, 3) and points.max() < found["roof"]
-            assert measured["full_braking"] == full.round(4).tolist()
-            assert measured["hypervolume"] == pytest.approx(volume_below(full.round(4), points))
-            assert measured["hypervolume_below_roof"] == pytest.approx(volume_below(np.full(3, found["roof"]), points))
-
-
 def test_ablation__page_and_file_say_the_same() -> None:
     costs = defaultdict(list)
     for row in rows_of(DOCS / "results" / "ablation.csv"):

@@ -120,17 +120,16 @@ def test_fitting_deceleration__without_room_is_that_of_one_millimetre(speed: flo
     assert seen(touching, 2, View(["front_1.fitting_deceleration"])) == {"front_1.fitting_deceleration": fitting}
 
 
-def test_brakes_that_build_up_and_weights__by_hand() -> None:
+def test_brakes_that_build_up__by_hand() -> None:
     # 0.7 s and 0.35 s of the own 7 m/s2; the brakes behind act at once; of the one in front nothing is known at first
-    view = View(["own_build_up_time", "own_release_time", "front_1.build_up_time", "rear_1.release_time", "place",
-                 "own_harm_weight", "front_1.harm_weight"])  # fmt: skip
+    view = View(["own_build_up_time", "own_release_time", "front_1.build_up_time", "rear_1.release_time", "place"])
     slow = state_of(
         [9.0, 30.0], [20.0, 20.0, 20.0], latency_s=[0.0, 0.5, 0.8], braking_capacity_mps2=[4.0, 7.0, 6.0],
-        brake_rate_mps3=[8.0, 10.0, math.inf], release_rate_mps3=[4.0, 20.0, math.inf], harm_weight=[3.0, 1.0, 4.0],
+        brake_rate_mps3=[8.0, 10.0, math.inf], release_rate_mps3=[4.0, 20.0, math.inf],
     )  # fmt: skip
-    assert [*seen(slow, 2, view).values()] == pytest.approx([0.7, 0.35, 0.0, 0.0, 1.0, 0.125, 0.0])
+    assert [*seen(slow, 2, view).values()] == pytest.approx([0.7, 0.35, 0.0, 0.0, 1.0])
     after = later(slow, [-4.0, 0.0, -6.0], 0.5)
-    assert [*seen(after, 2, view).values()] == pytest.approx([0.7, 0.35, 0.5, 0.0, 1.0, 0.125, 0.375])
+    assert [*seen(after, 2, view).values()] == pytest.approx([0.7, 0.35, 0.5, 0.0, 1.0])
 
 
 def test_what_is_observed__is_clipped_to_its_bounds() -> None:
@@ -143,11 +142,13 @@ def test_what_is_observed__is_clipped_to_its_bounds() -> None:
     assert (found >= low).all() and (found <= high).all() and (found == high).sum() >= 5
 
 
-@pytest.mark.parametrize("listed", [["rear_1", "own_build_up_time", "front_2.hit"], ["front_1.harm_weight", "front_1"]])
+@pytest.mark.parametrize(
+    "listed", [["rear_1", "own_build_up_time", "front_2.hit"], ["front_1.build_up_time", "front_1"]]
+)
 def test_view__of_some_features_has_the_bits_of_the_whole_in_its_own_order(listed: list[str]) -> None:
     view = View(listed)
     groups = View(["own", "front_1", "front_2", "rear_1", "role", "obstacle", "place", "own_build_up_time",
-                   "front_1.harm_weight"])  # fmt: skip
+                   "front_1.build_up_time"])  # fmt: skip
     whole = dict(zip(groups.names, groups.observe(braked(), np.array([3]), 0.1)[0, 0], strict=True))
     assert view.observe(braked(), np.array([3]), 0.1)[0, 0].tolist() == [whole[name] for name in view.names]
 
@@ -197,7 +198,7 @@ def test_full_state__has_every_vehicle_pair_time_and_obstacle(name: str, size: i
         ([], "must be a list of groups and features"),
         ([1], "1: must be the name of a group or of a feature"),
         (["own", "own.speed"], "own.speed is listed twice"),
-        (["harm_weight"], "describes a neighbour; write front_1.harm_weight"),
+        (["build_up_time"], "describes a neighbour; write front_1.build_up_time"),
         (["own.sped"], "did you mean 'own.speed'"),
     ],
 )

@@ -80,7 +80,7 @@ def test_harm_of_the_obstacle__is_that_of_vehicle_1() -> None:
 
 def met(pairs: tuple[float, float] = (12.0, 9.0), total: tuple[float, float] = (12.0, 30.0)) -> State:
     """Pair 1 met with 12 m2/s2 (masses 1, 2), pair 2 with 9 (masses 2, 1), then with 21 more; e = 0.5."""
-    state = state_of([0.0, 0.0], [0.0, 0.0, 0.0], mass_t=[1.0, 2.0, 1.0], restitution=0.5, harm_weight=[0.0, 1.0, 3.0])
+    state = state_of([0.0, 0.0], [0.0, 0.0, 0.0], mass_t=[1.0, 2.0, 1.0], restitution=0.5)
     state.line[0, at.FIRST, 1:3], state.line[0, at.TOTAL, 1:3], state.line[0, at.IMPACTS, 1:3] = pairs, total, (1, 2)
     return state
 
@@ -98,7 +98,6 @@ def of_objective(objective: Any, state: State, count: str = "first") -> list[flo
         ("social:45", [21 / 2**0.5] * 3),
         ("social:30", [x * 0.75**0.5 + (21 - x) / 2 for x in (8, 7, 6)]),
         ("maximin", [8.0, 8.0, 8.0]),
-        ("preference", [18.75] * 3),  # 3 (7 + 3 x 6) / 4
         ("mass-weighted", [21.0, 21.0, 21.0]),
         ("weighted:1,4,2", [3 * (8 + 4 * 7 + 2 * 6) / 7] * 3),
         (("total", "own", "maximin"), [21.0, 7.0, 8.0]),

@@ -96,8 +96,6 @@ GROUPS = [
     "obstacle",
     "front_2.build_up_time",
     "rear_2.release_time",
-    "front_2.harm_weight",
-    "rear_2.harm_weight",
 ]
 
 

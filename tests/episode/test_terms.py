@@ -260,7 +260,6 @@ def test_objective__that_leaves_an_impact_without_weight_warns_once() -> None:
         ("paper-random-obstacle", "weighted:1,0,1"),
         ("paper-random", "first:weighted:0,0,2,then:total"),
         ("paper-random", ["vehicle_3", "total", "vehicle_1"]),  # only Vehicle 2 learns
-        ("paper-random-preference", "preference"),
     ],
     ids=str,
 )

@@ -80,7 +80,7 @@ def test_vector_rewards__are_the_harm_that_each_vehicle_bears() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scenario", "observation"), [("paper-random", ["own", "own_harm_weight"]), ("cooperation-2-five", None)]
+    ("scenario", "observation"), [("paper-random", ["own", "own_build_up_time"]), ("cooperation-2-five", None)]
 )
 def test_environment__can_be_pickled_before_and_after_it_observes(scenario: str, observation: list[str] | None) -> None:
     env = began(scenario=scenario, observation=observation)

@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ethbrake_marl.episode.departures import PLAIN_ROWS
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.evaluation.provenance import MOTION
+from ethbrake_marl.evaluation.provenance import MOTION, plain_car
 from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
 from tests.fixtures.scenarios import SHIPPED
 
@@ -24,7 +23,7 @@ RECORDED, RECORDED_TRAINING = (json.loads(file.read_text("utf-8")) for file in (
 
 def digest(worlds: State) -> str:
     sha256 = hashlib.sha256()
-    for array in (worlds.line[:, MOTION], worlds.car[:, PLAIN_ROWS], worlds.know, worlds.wanted):
+    for array in (worlds.line[:, MOTION], plain_car(worlds), worlds.know, worlds.wanted):
         sha256.update(np.ascontiguousarray(array, "<f8").tobytes())
     return sha256.hexdigest()
 

@@ -13,11 +13,10 @@ from ethbrake_marl.motion.layout import Floats, scratch_for
 ROWS = {
     "mass_t": at.MASS, "speed_limit_mps": at.LIMIT, "latency_s": at.LATENCY, "braking_capacity_mps2": at.BRAKING,
     "driving_capacity_mps2": at.DRIVING, "brake_rate_mps3": at.BRAKE_RATE, "release_rate_mps3": at.RELEASE_RATE,
-    "harm_weight": at.WEIGHT,
 }  # fmt: skip
 USUAL = {
     "mass_t": 1.0, "speed_limit_mps": 64.0, "latency_s": 0.0, "braking_capacity_mps2": 16.0,
-    "driving_capacity_mps2": 16.0, "brake_rate_mps3": np.inf, "release_rate_mps3": np.inf, "harm_weight": 1.0,
+    "driving_capacity_mps2": 16.0, "brake_rate_mps3": np.inf, "release_rate_mps3": np.inf,
 }  # fmt: skip
 
 

@@ -43,7 +43,6 @@ RANGES: dict[str, tuple[float, float, dict[str, Any]]] = {
     "friction": (LEAST, 2.0, {}),
     "brake_rate_mps3": (LEAST, 1e6, {}),
     "release_rate_mps3": (LEAST, 1e6, {"brake_rate_mps3": 9}),
-    "harm_weight": (0.0, 1e6, {"objective": "preference"}),
 }
 FORMS: dict[str, Callable[[float, float], Any]] = {  # of a value and of another one that is right
     "number": lambda value, right: value,
@@ -86,8 +85,6 @@ CASES = [  # each quantity as a number, and one in all other forms
 def test_quantity__at_its_limit_is_accepted_and_beyond_it_is_refused(key: str, form: str) -> None:
     low, high, more = RANGES[key]
     rule, vehicles = QUANTITIES[key], 3 if QUANTITIES[key].per == "pair" else 2
-    if key == "harm_weight" and form != "list":
-        low = 1e-6  # somebody has such a weight
     for value, beyond in ((low, below(key)), (high, above(key))):
         also = {**more, **ends(key, value), "vehicles": vehicles}
         right = value if key in ("speed_deviations_mps", "line_speed_mps", "speeds_mps") else min(max(1.0, low), high)
@@ -127,10 +124,6 @@ def accepts(given: dict[str, Any]) -> bool:
 
 
 def test_pair_of_keys__at_its_limit_is_accepted_and_beyond_it_is_refused() -> None:
-    weights = {"vehicles": 2, "objective": "preference"}
-    Scenario(**BASE, **weights, harm_weight=[0, 1e-6])
-    with refused("at least one vehicle must always have a weight of 1e-06 or more"):
-        Scenario(**BASE, **weights, harm_weight=[0, math.nextafter(1e-6, 0.0)])
     for key in ("latency_s", "alert_s"):
         late = {**BASE, "horizon_s": 9.0}
         Scenario(**{**late, key: math.nextafter(9.0, 0.0)})

@@ -94,9 +94,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     "initial_state: with v2x: nominal, it is random what the vehicles learn about": lambda: worlds_from_state(
         PAPER.replace(v2x="nominal", early_impacts="keep"), {"gaps_m": 7, "speeds_mps": 20}
     ),
-    "initial_state: harm_weight[0] = 0: at least one vehicle must always have a weight of 1e-06 or more": lambda: (
-        worlds_from_state(PAPER.replace(harm_weight=[1, 4, 1], gaps_m=7, speeds_mps=20), {"harm_weight": 0})
-    ),
     "initial_state: braking_capacity_mps2[0] = 1: must be at least 2 m/s2 on the road, because": lambda: (
         worlds_from_state(
             PAPER.replace(roles={"vehicle_1": "constant:2"}), STATE | {"braking_capacity_mps2": [1, 2, 2]}

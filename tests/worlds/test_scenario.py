@@ -194,7 +194,7 @@ def test_mixture__is_world_by_world_that_of_its_members(empty_folder: Path) -> N
 
 # Each kind of scenario; `tests/golden` draws the worlds of all.
 KINDS = [
-    "paper-random", "paper-random-obstacle", "paper-random-preference", "realistic-mixed-buildup", "stress-wide",
+    "paper-random", "paper-random-obstacle", "realistic-mixed-buildup", "stress-wide",
     "cooperation-2-five", "cooperation-4-congested", "benchmark-noisy", "mixture-three-tests", "standards-r157",
 ]  # fmt: skip
 

@@ -36,7 +36,7 @@ def test_state__is_filled_in_with_what_is_fixed(scenario: Any, state: Any, expec
     assert worlds.clock[:, 5].tolist() == [-1.0]
 
 
-@pytest.mark.parametrize("name", ["realistic-mixed-buildup", "paper-random-obstacle", "paper-random-preference"])
+@pytest.mark.parametrize("name", ["realistic-mixed-buildup", "paper-random-obstacle"])
 def test_table_of_what_was_drawn__is_the_same_worlds(name: str) -> None:
     scenario = load_scenario(name)
     drawn = scenario.draw(50, 3)

@@ -21,9 +21,7 @@ from ethbrake_marl.motion.layout import BRAKING, DRIVING, GAP, LATENCY, LIMIT, O
 from ethbrake_marl.worlds.quantities import CAR_QUANTITIES, QUANTITIES
 
 OF_LINE = {"speeds_mps": SPEED, "gaps_m": GAP}
-OF_CAR = {
-    key: row for key, row in CAR_QUANTITIES.items() if key not in ("speed_limit_mps", "harm_weight", "restitution")
-}
+OF_CAR = {key: row for key, row in CAR_QUANTITIES.items() if key not in ("speed_limit_mps", "restitution")}
 UNCERTAIN = (*OF_CAR, *OF_LINE)
 MOST_CORNERS = 1024  # of one world; each takes as much time as the world itself
 EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"

@@ -1,4 +1,4 @@
-"""What cooperation is worth (``study ablate``), and what sparing one vehicle costs the others (``study front``)."""
+"""What cooperation is worth (``study ablate``)."""
 
 from typing import TYPE_CHECKING
 

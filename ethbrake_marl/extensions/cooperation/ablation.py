@@ -35,7 +35,7 @@ from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.extensions.studies.folder import work_in
-from ethbrake_marl.motion.layout import FAR_M, GAP, OWN_LATENCY, WEIGHT, Bools, Floats
+from ethbrake_marl.motion.layout import FAR_M, GAP, OWN_LATENCY, Bools, Floats
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.job import Job
@@ -278,7 +278,7 @@ def can_imitate(imitator: Answer, original: Answer) -> Bools:
         imitator_scenario.roles[n] != original_scenario.roles[n] for n in scripted
     ):
         return np.zeros(imitator.worlds.n, np.bool_)
-    rows = [row for row in range(imitator.worlds.car.shape[1]) if row not in (OWN_LATENCY, WEIGHT)]
+    rows = [row for row in range(imitator.worlds.car.shape[1]) if row != OWN_LATENCY]
     same = (imitator.worlds.line[:, :, 1:] == original.worlds.line[:, :, 1:]).all(axis=(1, 2))
     same &= (imitator.worlds.car[:, rows, 1:] == original.worlds.car[:, rows, 1:]).all(axis=(1, 2))
     first, later = (

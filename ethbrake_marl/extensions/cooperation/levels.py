@@ -25,7 +25,7 @@ STANDARD = ("level-0-sensors", "level-1-messages", "level-2-own", "level-3-line"
 SWEEP_LEVEL = "cooperation-3-pair"  # default level of a sweep
 
 SHARED_KEYS = ("vehicles", "time_step_s", "horizon_s", "observation")  # keys that are the same at all levels
-MAY_DIFFER = ("obstacle_gap_m", "harm_weight")  # beginnings of columns of the worlds
+MAY_DIFFER = "obstacle_gap_m"  # column of the worlds in which levels may differ
 SAME_VEHICLES = ("objective", "obstacle_gap_m", "roles", "v2x")  # keys whose sweep leaves the vehicles as they are
 
 MOST_VALUES = 100  # values of a sweep, such as ``objective=social:0..90:15`` (0, 15, ..., 90 degrees)
@@ -181,4 +181,4 @@ def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Dra
 def _quantities(level: Level, drawn_worlds: DrawnWorlds) -> dict[str, Any]:
     keys = {key: np.array([str(getattr(level.scenario, key))]) for key in SHARED_KEYS}
     columns = quantities_of(drawn_worlds.worlds)
-    return keys | {name: column for name, column in columns.items() if not name.startswith(MAY_DIFFER)}
+    return keys | {name: column for name, column in columns.items() if name != MAY_DIFFER}

@@ -128,6 +128,5 @@ def test_who_is_not_known__is_not_forecast_whatever_it_does() -> None:
 
 
 def test_policies_that_observe_forecasts__have_a_range() -> None:
-    assert shipped_policies().keys() == {"ppo", "sac", "vine-paper", "vine-preference"}
-    for name in ("vine-paper", "vine-preference"):
-        assert load_shipped(name).manifest.training_range is not None
+    assert shipped_policies().keys() == {"ppo", "sac", "vine-paper"}
+    assert load_shipped("vine-paper").manifest.training_range is not None
