@@ -4,7 +4,6 @@
 With ``--output``, finished chunks are saved beside the file, and the same command continues after an interruption.
 ``--merge`` takes the better of several tables in each world, so that searches with other seeds add up.
 ``--shipped`` prints proven and best known harm of every shipped table that has harm, and the gap between them.
-``--costs`` prints proven and best known honest cost of every shipped table that has the cost, and their ratio.
 ``--restamp`` renews the digest of the physics in every shipped table whose harms are still the same, bit for bit.
 """
 
@@ -14,7 +13,6 @@ import argparse
 import shlex
 import shutil
 import sys
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,7 +26,7 @@ from ethbrake_marl.episode.counts import COUNTS, IMPACT_COUNTS, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.extensions.proofs.measures import avoidable, proven_cost, proven_harm
+from ethbrake_marl.extensions.proofs.measures import avoidable, proven_harm
 from ethbrake_marl.extensions.search.best_harm import SEARCH_BUDGET, search_list
 from ethbrake_marl.extensions.search.pricing import best_of, problem_of
 from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable, outdated_tables, shipped_tables
@@ -47,7 +45,6 @@ def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--shipped", action="store_true", help="print the shipped tables instead")
-    add("--costs", action="store_true", help="print proven and best known honest costs instead; takes minutes")
     add("--restamp", action="store_true", help="after a change of the physics' code: renew the shipped tables' digests")
     add("--scenario", default="paper-random")
     add("--episodes", type=int, default=10_000, help="worlds of the list")
@@ -74,10 +71,6 @@ def main(words: list[str]) -> None:
     given = parser.parse_args(words)
     if given.restamp:
         sys.exit(0 if restamp(TABLE_FOLDER) else 1)
-    if given.costs:
-        for table in shipped_tables():
-            print_cost(table)
-        return
     if given.shipped:
         if outdated := outdated_tables():
             print(f"left out, because they were made for other physics: {', '.join(outdated)}", file=sys.stderr)
@@ -196,26 +189,6 @@ def proven(game: Game, alert: State, first: Floats, total: Floats) -> list[Any]:
     there = [float(first[between].mean()), float((total[between] < NO_HARM).mean())] if between.any() else [None, None]
     rates = (float(each.mean()) for each in (~verdict[""], bound["impact"], between))
     return [float(bound[""].mean()), *rates, *there]
-
-
-def print_cost(table: BestHarmTable) -> None:
-    """Print proven and best known honest cost of a table, and their ratio with its 95 % interval."""
-    scenario, game, alert = worlds_of(table)
-    if "honest" not in table.harm:
-        return
-    try:
-        start, bound = time.process_time(), proven_cost(game, alert, alert)
-    except InvalidInput as error:
-        print(f"{scenario.name}: {error}")
-        return
-    assert isinstance(bound, dict)
-    best, seconds = table.harm["honest"], time.process_time() - start
-    ratio = bound[""].mean() / best.mean()
-    half = 1.96 * float(np.std(bound[""] - ratio * best)) / best.mean() / alert.n**0.5
-    print(
-        f"{scenario.name}: proven {bound[''].mean():.3f}, best known {best.mean():.3f}, ratio {ratio:.4f} +- {half:.4f}"
-        f", {seconds / alert.n:.3f} s of processor time a world"
-    )
 
 
 def shipped_bounds(tables: Iterable[BestHarmTable]) -> Sheet:

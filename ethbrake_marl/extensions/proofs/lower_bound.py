@@ -213,9 +213,7 @@ def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
 
     ``rows`` [n, LINE_COLUMNS]: the worlds (columns: ``proofs/line.py``). Harm after ``until`` [n] (s) does not count.
     ``has_front`` [n]: whether the front vehicle exists and the next impact with it counts; ``has_rear`` [n]: the same
-    for the rear vehicle. ``unavoidable`` [n]: whether contact cannot be avoided. ``boxes`` and ``memory``
-    (``chain_search``): without columns, the bound on both pairs is that of harm; otherwise that of the honest cost.
-    ``cells``, ``boxes``, ``memory``: overwritten.
+    for the rear vehicle. ``unavoidable`` [n]: whether contact cannot be avoided. ``cells``: overwritten.
     """
     for k in range(len(out)):
         for column in range(BOUNDS):
@@ -248,9 +246,8 @@ def lower_bound(
     Args:
         state: the n episodes now.
         body: the controlled vehicle (1: Vehicle 1); all others brake fully.
-        harm_count: ``first`` (of each pair only the first impact), ``total``, or ``honest``. The honest cost is never
-            below total harm; with a time step, ``combined`` also counts the prices of pushing and driving and further
-            impacts (``chain_search``), which takes 0.02 s a world.
+        harm_count: ``first`` (of each pair only the first impact), ``total``, or ``honest``: total harm, which the
+            honest cost is never below.
         horizon_s: time until which harm counts, s after the alert.
         time_step_s: time between two decisions (s); the first decision is when the vehicle may act. None: commands
             may change at any time. With a time step the bound is larger, but holds only for commands that change at

@@ -29,7 +29,7 @@ def avoidable(game: Game, alert: State, last: State) -> MeasureValue:
     return {"": verdict.avoidable, "reason": verdict.reason_name}
 
 
-_bound_cache: list[tuple[bytes, LowerBound]] = []  # worlds of the last request, and their bounds
+_last_bound: list[tuple[bytes, LowerBound]] = []  # the last request, and its bounds
 
 
 def proven_harm(game: Game, alert: State, last: State) -> MeasureValue:
@@ -46,12 +46,14 @@ def _bound(game: Game, alert: State) -> LowerBound:
     ends = np.array([body, settings.horizon_s, settings.time_step_s])
     departures = " ".join(sorted(alert.departures)).encode()  # a stored bound must not pass worlds that are refused
     request = departures + ends.tobytes() + alert.line.tobytes() + alert.car.tobytes()
-    if not _bound_cache or request != _bound_cache[0][0]:
-        bound = lower_bound(
-            alert, body, harm_count=FIRST_IMPACTS, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s
-        )
-        _bound_cache[:] = [(request, bound)]
-    return _bound_cache[0][1]
+    for last_request, last_bound in _last_bound:
+        if last_request == request:
+            return last_bound
+    bound = lower_bound(
+        alert, body, harm_count=FIRST_IMPACTS, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s
+    )
+    _last_bound[:] = [(request, bound)]
+    return bound
 
 
 def _controlled_body(game: Game, alert: State, *, together: bool = False) -> int:
