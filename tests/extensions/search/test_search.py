@@ -234,7 +234,6 @@ REFUSED = {
     "harm_counts = ('first', 'first'): must be one or more counts of harm, each once": lambda: best_harm(
         GAME, sampled(), harm_counts=("first", "first")
     ),
-    "profiles: command -50 m/s2 of vehicle_2": lambda: refine(paper(), steady() - 46.0, budget=5),
 }
 
 
