@@ -4,7 +4,7 @@
 
     spec    = agent, then any number of "+" wrapper
     agent   = NAME[:ARGUMENT][@PATH], or FILE.py:FUNCTION[:ARGUMENT][@PATH]
-    wrapper = NAME[:ARGUMENT], a search or a shield around what stands before it
+    wrapper = NAME[:ARGUMENT], a shield around what stands before it
 
 The tables ``AGENTS`` and ``WRAPPERS`` contain the names. An entry called ``NAME.ARGUMENT`` replaces the entry ``NAME``
 for this argument. An agent's entry may also be a group: a list of specs, such as ``ladder``. Lists are split at commas,
@@ -109,10 +109,10 @@ def register_shield(
     knows: str = UNSTATED,
     form: str | None = None,
 ) -> None:
-    """Register a shield or search under a name that can follow a ``+``. Entry points: ``ethbrake_marl.shields``.
+    """Register a shield under a name that can follow a ``+``. Entry points: ``ethbrake_marl.shields``.
 
-    ``make(team, argument, settings)`` returns the team with the shield or search around it; the other arguments are as
-    in ``register_agent``. A shield's name is also a ``mode`` of ``eb.shield``, which passes further keywords as
+    ``make(team, argument, settings)`` returns the team with the shield around it; the other arguments are as in
+    ``register_agent``. A shield's name is also a ``mode`` of ``eb.shield``, which passes further keywords as
     ``settings.options``.
     """
     _add(WRAPPERS, name, make, about, knows, form)
@@ -130,7 +130,7 @@ def _add(table: Registry[AgentEntry], name: str, make: Any, about: str, knows: s
 
 
 AGENTS: Registry[AgentEntry] = Registry("agent", "agents", register_agent)
-WRAPPERS: Registry[AgentEntry] = Registry("shield or search", "shields", register_shield)
+WRAPPERS: Registry[AgentEntry] = Registry("shield", "shields", register_shield)
 
 
 def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: AnyCount = HONEST) -> AgentOrTeam:
@@ -356,8 +356,8 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
                 raise kind(f"{where}: {error}") from None
             if isinstance(agent, Team):
                 raise InvalidInput(
-                    f"{where}: is a team, or has a shield or a search; a vehicle that does not learn must be driven by"
-                    " a single agent"
+                    f"{where}: is a team, or has a shield; a vehicle that does not learn must be driven by a single"
+                    " agent"
                 )
             scripts[body] = agent
     return scripts

@@ -26,7 +26,7 @@ _MOST_SUGGESTED = 3  # names that an error message suggests
 
 NAMES = {  # kind -> place of its names, or of a function that lists them; imported only when an error needs them
     "agent": "ethbrake_marl.agent_names:AGENTS",
-    "shield or search": "ethbrake_marl.agent_names:WRAPPERS",
+    "shield": "ethbrake_marl.agent_names:WRAPPERS",
     "scenario": "ethbrake_marl.worlds.catalogue:scenario_paths",
     "recipe": "ethbrake_marl.training.recipe:shipped_recipes",
 }

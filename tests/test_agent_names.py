@@ -81,7 +81,7 @@ def test_a_script__has_the_name_that_it_was_asked_for_by(spec: str):
         ("constant", "constant needs a finite deceleration"),
         ("full_brake:3", "full_brake takes no argument"),
         ("full_brake@x", "full_brake uses no policy"),
-        ("full_brake+stepp", "unknown shield or search 'stepp'"),
+        ("full_brake+stepp", "unknown shield 'stepp'"),
         ("x.py:make", "file 'x.py': does not exist"),
         ("", "must be a name"),
         ("a@", "a path must follow '@'"),

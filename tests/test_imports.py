@@ -113,7 +113,7 @@ def test_start__version_every_help_and_completion_import_nothing_heavy() -> None
         (
             "ethbrake_marl.Scenario",
             "training.recipe import load_recipe as load; name = 'step'",
-            "'step' names another kind: shield or search",
+            "'step' names another kind: shield",
         ),
         (
             "run_command(['scenario', 'show', 'paper-random'])",

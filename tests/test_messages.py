@@ -70,7 +70,7 @@ def test_whole_number__is_in_its_range_and_no_truth_value(value: object) -> None
     ("call", "message"),
     [
         (lambda: eb.evaluate("ppo+step", "paper-random"), "'ppo' names another kind: agent, recipe"),
-        (lambda: eb.make_agent("step"), "'step' names another kind: shield or search"),
+        (lambda: eb.make_agent("step"), "'step' names another kind: shield"),
         (lambda: eb.evaluate(measures="pushed", episodes=1), "did you mean 'pushed_m' or 'pushed_mps'?"),
         (lambda: eb.load_scenario("level-0-sensor"), "did you mean 'level-0-sensors'?"),
         (lambda: eb.parallel_env(reward={"comfort": 1.0}), "must be registered first, for instance by --load FILE.py"),

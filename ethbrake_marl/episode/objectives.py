@@ -1,7 +1,6 @@
 """Objectives: whose harm a vehicle should minimise.
 
-Let ``H_j`` be the harm that vehicle j bears (m2/s2), ``H`` the harm of the line and ``m_j`` the mass of vehicle j.
-Vehicle i minimises:
+Let ``H_j`` be the harm that vehicle j bears (m2/s2), ``H`` the harm of the line. Vehicle i minimises:
 
 ==================  ================================================================================================
 total               ``H``
@@ -9,17 +8,11 @@ own                 ``H_i``
 vehicle_K           ``H_K``
 social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``: social value orientation, 0 to 90 degrees
 maximin             ``max_j H_j``
-mass-weighted       ``N sum_j m_j H_j / sum_j m_j``
 weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``, one weight per vehicle, 0 or from 1e-6 to 1e6
-first:A,then:B      ``1000 A + B`` for two other objectives: nearly their lexicographic order
 ==================  ================================================================================================
 
-All are weighted sums of the vehicles' harm, except ``maximin``, registered objectives, and a ``first`` that contains
-one of these.
-
-``first:A,then:B`` lets B break ties of A. The order is lexicographic if two actions differ in A by more than a
-thousandth of their difference in B. Some objectives give the impacts of a pair no weight (``free_pairs``); then causing
-them costs nothing.
+All are weighted sums of the vehicles' harm, except ``maximin`` and registered objectives. Some give the impacts of a
+pair no weight (``free_pairs``); then causing them costs nothing.
 """
 
 from __future__ import annotations
@@ -44,7 +37,6 @@ from ethbrake_marl.registry import Registry
 Declared = str | Sequence[str]  # one objective for all vehicles, or one for each
 
 PERSONAL = ("own", "social")  # objectives whose amount depends on the vehicle, beside registered ones
-FIRST_WEIGHT = 1000.0  # weight of A in ``first:A,then:B``; B keeps the scale for which recipes are tuned
 
 
 class Harm(NamedTuple):
@@ -104,16 +96,15 @@ class Objective(NamedTuple):
     kind: Kind
     numbers: tuple[float, ...] = ()
     argument: str = ""  # of a registered objective
-    parts: tuple[Objective, ...] = ()  # of first:...,then:...
 
     @property
     def is_sum(self) -> bool:
-        return self.kind.weights is not None and all(part.is_sum for part in self.parts)
+        return self.kind.weights is not None
 
     @property
     def differs(self) -> bool:
         """Whether two vehicles with this objective may minimise different amounts, as with ``own``."""
-        return self.kind.name in PERSONAL or self.kind.function is not None or any(part.differs for part in self.parts)
+        return self.kind.name in PERSONAL or self.kind.function is not None
 
     def amount(self, harm: Harm, vehicle: int) -> Floats:
         """Amount that ``vehicle`` (0: Vehicle 1) should minimise, [n]."""
@@ -146,8 +137,6 @@ def parse_objective(text: str) -> Objective:
         if text == name:
             raise InvalidInput("objective 'vehicle_K': must name a vehicle, as in vehicle_3")
         return Objective(kind, (float(text.removeprefix("vehicle_")),))
-    if name == "first":
-        return Objective(kind, parts=_first_and_then(text, argument))
     if ":" not in kind.form:
         if colon:
             raise InvalidInput(f"objective {text!r}: {name} takes no argument")
@@ -173,16 +162,6 @@ def parse_objective(text: str) -> Objective:
     return Objective(kind, numbers)
 
 
-def _first_and_then(text: str, argument: str) -> tuple[Objective, ...]:
-    texts = argument.split(",then:")
-    if len(texts) != 2 or not all(texts) or any(objective_name(part) == "first" for part in texts):
-        raise InvalidInput(
-            f"objective {text!r}: first needs one objective, and then another one, as in first:vehicle_3,then:total;"
-            " neither may contain first"
-        )
-    return tuple(parse_objective(part) for part in texts)
-
-
 def objective_name(text: str) -> str:
     """Name of an objective without its argument: ``social`` for ``social:45``, ``vehicle_K`` for ``vehicle_3``."""
     return re.sub("vehicle_[1-9][0-9]?", "vehicle_K", text) if ":" not in text else text.partition(":")[0]
@@ -206,8 +185,7 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
         )
     parsed = tuple(parse_objective(text) for text in texts)
     for text, objective in zip(texts, parsed, strict=True):
-        for part in objective.parts or (objective,):
-            _check_vehicles(text, part, vehicles)
+        _check_vehicles(text, objective, vehicles)
     return parsed
 
 
@@ -232,6 +210,15 @@ def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: b
         return []
     counts = np.concatenate([[0.0], objective.weights(np.ones((1, CAR_ROWS, vehicles + 1)), vehicle)[0]]) > 0.0
     return [pair for pair in range(0 if obstacle else 1, vehicles) if not counts[pair] and not counts[pair + 1]]
+
+
+def with_every_weight(objective: Objective, vehicles: int) -> str:
+    """``weighted`` with 1 for each weight of 0 of ``weighted`` or ``vehicle_K``, and at least 1,000 for the others."""
+    weights = objective.numbers
+    if objective.kind.name == "vehicle_K":
+        weights = tuple(float(vehicle == weights[0]) for vehicle in range(1, vehicles + 1))
+    least = min(weight for weight in weights if weight)
+    return f"weighted:{','.join(f'{min(1e3 * weight / least, 1e6) if weight else 1:g}' for weight in weights)}"
 
 
 def amounts(objectives: Sequence[Objective], before: State | None, after: State, count: HarmCount) -> Floats:
@@ -276,10 +263,6 @@ def _unit_weights(car: Floats, vehicle: int) -> Floats:
 
 def _social(harm: Harm, vehicle: int, own_weight: float, others_weight: float) -> Floats:
     return own_weight * harm.borne[:, vehicle] + others_weight * (harm.whole - harm.borne[:, vehicle])
-
-
-def _lexicographic_sum(first_and_then: Sequence[Floats]) -> Floats:
-    return FIRST_WEIGHT * first_and_then[0] + first_and_then[1]
 
 
 def register_objective(
@@ -335,11 +318,6 @@ OBJECTIVES: Registry[Kind] = Registry(
         "maximin": Kind(
             "maximin", "harm of the vehicle that bears most", lambda harm, i, written: harm.borne.max(axis=1)
         ),
-        "mass-weighted": Kind(
-            "mass-weighted", "harm of all vehicles, weighted by their masses",
-            lambda harm, i, written: harm.weighted(harm.car[:, MASS, 1:]),
-            lambda car, i, written: _shares(car[:, MASS, 1:]),
-        ),
         "weighted": Kind(
             "weighted:W1,W2,...", "harm of all vehicles, with one given weight per vehicle",
             lambda harm, i, written: harm.weighted(np.full(harm.borne.shape, written.numbers)),
@@ -349,11 +327,6 @@ OBJECTIVES: Registry[Kind] = Registry(
             "vehicle_K", "harm that Vehicle K bears",
             lambda harm, i, written: harm.borne[:, int(written.numbers[0]) - 1],
             lambda car, i, written: _unit_weights(car, int(written.numbers[0]) - 1),
-        ),
-        "first": Kind(
-            "first:OBJECTIVE,then:OBJECTIVE", "one objective; another one, a thousand times lighter, breaks its ties",
-            lambda harm, i, written: _lexicographic_sum([part.amount(harm, i) for part in written.parts]),
-            lambda car, i, written: _lexicographic_sum([part.weights(car, i) for part in written.parts]),
         ),
     },
 )  # fmt: skip

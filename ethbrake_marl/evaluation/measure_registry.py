@@ -105,7 +105,7 @@ _REWARDED: dict[str, TermFunction] = {
 
 def split_names(names: str) -> list[str]:
     """Names in a text, split at commas, except those within an objective such as ``weighted:1,4,1``."""
-    return re.split(r",(?!then:|\s*[\d.][\d.e+-]*(?:,|$))", names)
+    return re.split(r",(?!\s*[\d.][\d.e+-]*(?:,|$))", names)
 
 
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:

@@ -53,8 +53,8 @@ class Driver:
         team = teams_of({"driver": agent}, loaded, harm_count=harm_count)["driver"]
         if team.shield is not None:
             raise InvalidInput(
-                f"Driver: agent {agent!r:.80} has a shield or a search, whose bound holds only in the physics of this"
-                " package; name an agent without it"
+                f"Driver: agent {agent!r:.80} has a shield, whose bound holds only in the physics of this package;"
+                " name an agent without it"
             )
         self.game, bodies = team.game(game), {f"vehicle_{body}": body for body in team.drivers}
         if vehicle not in bodies:

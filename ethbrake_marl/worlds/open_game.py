@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.episode.game import Game, Script
-from ethbrake_marl.episode.objectives import Declared, free_pairs, objectives_of
+from ethbrake_marl.episode.objectives import Declared, free_pairs, objectives_of, with_every_weight
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.script_calls import guard_scripts
@@ -70,10 +70,11 @@ def _warn_of_ties(scenario: Scenario, declared: Declared) -> None:
         if pairs:
             text = declared if isinstance(declared, str) else declared[body - 1]
             partner = f"vehicle_{pairs[0] + 1}" if pairs[0] else "the obstacle"
+            better = with_every_weight(objectives[body - 1], scenario.vehicles)
             _warn_once(
                 f"objective {text}: an impact between vehicle_{max(pairs[0], 1)} and {partner} has no weight, so"
-                f" vehicle_{body} may cause it; write first:{text},then:total to let the harm of the whole line decide"
-                " between actions that are equal otherwise"
+                f" vehicle_{body} may cause it; write {better} to let the harm of the whole line decide between actions"
+                " that are equal otherwise"
             )
 
 

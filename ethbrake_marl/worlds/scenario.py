@@ -148,7 +148,7 @@ class Scenario(ScenarioPart):
     objective: str | Annotated[tuple[str, ...], Field(strict=False)] = Field(
         default="total",
         description="whose harm a reward counts: one objective for all vehicles, or a list with one per vehicle",
-        examples=["own", "weighted:1,4,1", "first:vehicle_3,then:total"],
+        examples=["own", "weighted:1,4,1", "weighted:1,1,1000"],
     )
     physics: str | None = Field(
         default=None, exclude_if=not_, description="name of a physics other than exact impacts, such as paper-map"

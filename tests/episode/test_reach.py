@@ -99,7 +99,7 @@ GROUPS = [
 ]
 
 
-@pytest.mark.parametrize("groups", [GROUPS, ["contact", "contact_far", "plan"]])
+@pytest.mark.parametrize("groups", [GROUPS, ["contact", "plan"]])
 @pytest.mark.parametrize("until_s", [0.5, 1.5, 3.0])
 def test_far_vehicles__change_no_bit_of_what_is_observed(until_s: float, groups: list[str]) -> None:
     if groups is not GROUPS and not {*groups} <= {*features.GROUPS}:

@@ -240,8 +240,7 @@ def test_objective__that_leaves_an_impact_without_weight_warns_once() -> None:
     paper, obstacle = load_scenario("paper-random"), load_scenario("paper-random-obstacle")
     text = (
         "objective weighted:0,0,1: an impact between vehicle_1 and vehicle_2 has no weight, so vehicle_2 may cause it;"
-        " write first:weighted:0,0,1,then:total to let the harm of the whole line decide between actions that are equal"
-        " otherwise"
+        " write weighted:1,1,1000 to let the harm of the whole line decide between actions that are equal otherwise"
     )
     with pytest.warns(FreeImpacts) as seen:
         open_game(paper.replace(objective="weighted:0,0,1"))
@@ -249,8 +248,14 @@ def test_objective__that_leaves_an_impact_without_weight_warns_once() -> None:
     assert [str(each.message) for each in seen] == [text]
     with pytest.warns(FreeImpacts, match="objective weighted:0,1,1: an impact between vehicle_1 and the obstacle has"):
         open_game(obstacle.replace(objective="weighted:0,1,1"))
-    with pytest.warns(FreeImpacts, match="vehicle_1: an impact between vehicle_2 and vehicle_3 has no weight"):
+    with pytest.warns(
+        FreeImpacts, match="between vehicle_2 and vehicle_3 has no weight, .* write weighted:1000,1,1 to"
+    ):
         open_game(paper.replace(objective=["own", "vehicle_1", "own"]))
+    five = load_scenario("cooperation-2-five")
+    with pytest.warns(FreeImpacts, match="write weighted:1,1,1000,4000,1e\\+06 to"):
+        open_game(five.replace(objective="weighted:0,0,2,8,1e5"))
+    open_game(five.replace(objective="weighted:1,1,1000,4000,1e+06"))
 
 
 @pytest.mark.parametrize(
@@ -258,7 +263,7 @@ def test_objective__that_leaves_an_impact_without_weight_warns_once() -> None:
     [
         ("paper-random", "weighted:0,1,1"),
         ("paper-random-obstacle", "weighted:1,0,1"),
-        ("paper-random", "first:weighted:0,0,2,then:total"),
+        ("paper-random", "weighted:1,1,1000"),
         ("paper-random", ["vehicle_3", "total", "vehicle_1"]),  # only Vehicle 2 learns
     ],
     ids=str,

@@ -99,7 +99,7 @@ def test_driver__refusals() -> None:
     driver.decide(0.7, *MEASURED)
     with refused("Driver.decide: time_s = 0.6: must be 0.7 or later"):
         driver.decide(0.6, *MEASURED)
-    with refused("Driver: agent 'ppo+step' has a shield or a search"):
+    with refused("Driver: agent 'ppo+step' has a shield, whose bound"):
         driver_of("ppo+step")
     with refused("agent 'ladder': is the name of a group of agents"):
         driver_of("ladder")

@@ -29,7 +29,7 @@ REWARDS: dict[str, Any] = {
     "ppo": {"harm": 0.05, "harm_count": "first", "terminal": 0.02, "shaping": 0.05, "shaping_discount": 0.995},
     **{
         objective: {"harm": 1.0, "harm_count": "total", "objective": objective}
-        for objective in ("own", "social:45", "maximin", "mass-weighted", "weighted:1,4,1")
+        for objective in ("own", "social:45", "maximin", "weighted:1,4,1")
     },
 }
 

@@ -233,7 +233,7 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: shield(Team("t", {2: COAST}), scenario="paper-random"), InvalidInput, "leave out scenario"),
     (lambda: shield(EthBrakeEnv(), scenario="paper-random"), InvalidInput, "EthBrakeEnv.*: leave out scenario"),
     (lambda: shield(EthBrakeEnv(), "coast+step"), InvalidInput, "policy 'coast\\+step' has a shield of its own"),
-    (lambda: shield(EthBrakeEnv(), mode="stp"), UnknownName, "unknown shield or search 'stp'; did you mean 'step'"),
+    (lambda: shield(EthBrakeEnv(), mode="stp"), UnknownName, "unknown shield 'stp'; did you mean 'step'"),
     (lambda: make_teams("coast+step+step", load_scenario("paper-random")), InvalidInput, "already has a shield"),
     (lambda: shield(EthBrakeEnv(), alowance=1), InvalidInput, "'alowance'; its options: harm_count, allowance, cap"),
     (

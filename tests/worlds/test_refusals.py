@@ -210,16 +210,12 @@ REFUSED: dict[str, Callable[[], object]] = {
         DELAYS, {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
     ),
     "objective 'maximin:3': maximin takes no argument": lambda: PAPER.replace(objective="maximin:3"),
-    "objective 'first:own,then:vehicle_4': there is no vehicle_4;": lambda: PAPER.replace(
-        objective=["own", "own", "first:own,then:vehicle_4"]
-    ),
-    "objective 'first:weighted:1,2,then:own': has 2 weights; must have 3": lambda: PAPER.replace(
-        objective="first:weighted:1,2,then:own"
-    ),
+    "objective 'vehicle_4': there is no vehicle_4;": lambda: PAPER.replace(objective=["own", "own", "vehicle_4"]),
+    "objective 'weighted:1,2': has 2 weights; must have 3": lambda: PAPER.replace(objective="weighted:1,2"),
     "objective 'vehicle_K': must name a vehicle, as in vehicle_3": lambda: PAPER.replace(objective="vehicle_K"),
-    "objective = \"first:ownn,then:total\": unknown objective 'ownn'; did you mean 'own'?": lambda: PAPER.replace(
-        objective="first:ownn,then:total"
-    ),
+    "objective = ownn: unknown objective 'ownn'; did you mean 'own'?": lambda: PAPER.replace(objective="ownn"),
+    "unknown objective 'first'; known: ": lambda: PAPER.replace(objective="first:own,then:total"),
+    "unknown objective 'mass-weighted'; did you mean 'weighted'?": lambda: PAPER.replace(objective="mass-weighted"),
     "table.columns = gap_9_m: unknown column; did you mean": lambda: PAPER.replace(
         table={"columns": ["gap_9_m"], "rows": [[1]]}
     ),
@@ -267,18 +263,6 @@ def test_roles__are_frozen(copied: Scenario) -> None:
 def test_agent_of_a_role__is_a_name_in_lower_case_and_an_argument(spec: str) -> None:
     with refused(f"agent {spec!r}: must be name or name:argument"):
         check_role(spec)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "first", "first:first:own,then:own,then:own", "then:own",
-    ],
-)  # fmt: skip
-def test_first__needs_two_objectives(text: str) -> None:
-    right = f"objective {text!r}: first needs one objective, and then another one, as in first:vehicle_3,then:total"
-    with refused("unknown objective 'then'" if text == "then:own" else right):
-        PAPER.replace(objective=text)
 
 
 @pytest.mark.parametrize("name", ["x" * 65, "x\n"])

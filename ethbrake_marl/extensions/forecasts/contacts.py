@@ -1,4 +1,4 @@
-"""The feature groups ``contact`` and ``contact_far``: a vehicle's next impacts if it brakes, coasts or drives fully.
+"""The feature group ``contact``: a vehicle's next impacts if it brakes, coasts or drives fully.
 
 A forecast simulates, for ``FORECAST_S``, the unbroken row of known vehicles around the observer, without those that
 cannot matter (``episode.reach``). There is no forecast for an observer that cannot predict a neighbour of which it
@@ -52,10 +52,9 @@ SIDES = {"front": "the vehicle ahead", "rear": "the vehicle behind"}
 # places of the features of `contact` for one command: those of an impact, for each side, then the harm
 IMPACT_TIME, IMPACT_CLOSING, IMPACT_FRACTION, IMPACT_STEPS, PER_SIDE = range(5)
 FIRST_HARM, TOTAL_HARM, PER_COMMAND = 2 * PER_SIDE, 2 * PER_SIDE + 1, 2 * PER_SIDE + 2
-FAR_PER_COMMAND = 4  # features of `contact_far`
 
 
-def impact_features(command: str, held: str) -> list[Feature]:
+def contact_features(command: str, held: str) -> list[Feature]:
     features = []
     for side, where in SIDES.items():
         name, impact = f"{command}_{side}", f"forecast for {held}, first impact with {where}"
@@ -65,30 +64,13 @@ def impact_features(command: str, held: str) -> list[Feature]:
             Feature(f"{name}_fraction", "1", 1.0, 0.0, 1.0, f"{impact}: time within its decision step, 0 to 1"),
             Feature(f"{name}_steps", "1", 10.0, 0.0, 2.0, f"{impact}: number of full decision steps before it"),
         ]
-    return features
-
-
-def _near(command: str, held: str) -> list[Feature]:
-    features = impact_features(command, held)
     for count in ("first_impact", "total"):
         about = f"forecast for {held}: {count.replace('_', '-')} harm of known pairs"
         features.append(Feature(f"{command}_{count}_harm", "m2/s2", 50.0, 0.0, 4.0, about))
     return features
 
 
-def _far(command: str, held: str) -> list[Feature]:
-    times = [
-        Feature(f"{command}_{side}_time", "s", 5.0, 0.0, 2.0, f"forecast for {held}, first impact with {where}: time")
-        for side, where in SIDES.items()
-    ]
-    return times + [
-        Feature(f"{command}_{count}_speed", "m/s", 10.0, 0.0, 6.0, f"forecast for {held}: square root of {count} harm")
-        for count in ("first_impact", "total")
-    ]
-
-
-CONTACT = tuple(feature for command, held in FORECAST_COMMANDS.items() for feature in _near(command, held))
-CONTACT_FAR = tuple(feature for command, held in FORECAST_COMMANDS.items() for feature in _far(command, held))
+CONTACT = tuple(feature for command, held in FORECAST_COMMANDS.items() for feature in contact_features(command, held))
 
 
 @kernel
@@ -127,13 +109,13 @@ def known_line(line, car, clock, know, i, observer_line, parameters, commands):
 
 @large
 def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out):
-    """Write the features ``contact`` and ``contact_far``, before scaling, to ``out`` [n, observers, F].
+    """Write the features ``contact``, before scaling, to ``out`` [n, observers, F].
 
     Returns the index of a world in which the simulation failed, or -1. ``line``, ``car``, ``clock``, ``know``: as in
     ``State``. ``observers``: numbers of the observing bodies. ``memory``: arrays that are overwritten.
     """
     scratch, here, observer_line, parameters, commands = memory
-    near, failed = 3 * PER_COMMAND, -1
+    failed = -1
     for k in range(len(out)):
         for o in range(len(observers)):
             i = observers[o]
@@ -153,10 +135,6 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
                 for p in range(first, last if has_impact else first):
                     value[FIRST_HARM] += scratch[NEW_FIRST, p]
                     value[TOTAL_HARM] += scratch[NEW_TOTAL, p]
-                far = near + c * FAR_PER_COMMAND
-                out[k, o, far], out[k, o, far + 1] = value[IMPACT_TIME], value[PER_SIDE + IMPACT_TIME]
-                out[k, o, far + 2] = math.sqrt(value[FIRST_HARM])
-                out[k, o, far + 3] = math.sqrt(value[TOTAL_HARM])
     return failed
 
 
@@ -183,13 +161,13 @@ def write_impacts(scratch, has_impact, i, first, last, time_step_s, value):
 
 
 def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
-    """Features ``contact`` and ``contact_far`` before scaling, [n, observers, F].
+    """Features ``contact`` before scaling, [n, observers, F].
 
     Raises ``PhysicsError`` if a simulation fails.
     """
     require(state, "a forecast of contacts", SHOWN)
     bodies = state.wanted.shape[1]
-    out = np.empty((state.n, len(observers), len(CONTACT) + len(CONTACT_FAR)))
+    out = np.empty((state.n, len(observers), len(CONTACT)))
     line, observer_line, parameters = (np.zeros((rows, bodies)) for rows in (LINE_ROWS, LINE_ROWS, CAR_ROWS))
     memory = scratch_for(bodies), line, observer_line, parameters, np.zeros(bodies)
     failed = forecast_worlds(state.line, state.car, state.clock, state.know, observers, time_step_s, memory, out)
@@ -198,5 +176,4 @@ def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
     return out
 
 
-NEAR_GROUP = Part(CONTACT, _forecasts, slice(0, len(CONTACT)))
-FAR_GROUP = Part(CONTACT_FAR, _forecasts, slice(len(CONTACT), None))
+GROUP = Part(CONTACT, _forecasts)

@@ -2,10 +2,5 @@
 
 CONTENTS = {
     "agents": {"plan": "planner:AGENT"},
-    "feature_groups": {
-        "contact": "contacts:NEAR_GROUP",
-        "contact_far": "contacts:FAR_GROUP",
-        "plan": "plan:GROUP",
-        "forecast": "plan:FORECAST_GROUP",
-    },
+    "feature_groups": {"contact": "contacts:GROUP", "plan": "plan:GROUP", "forecast": "plan:FORECAST_GROUP"},
 }

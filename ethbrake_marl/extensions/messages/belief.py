@@ -170,5 +170,5 @@ def require_pieces(
             raise InvalidInput(
                 f"{who}: messages of vehicle_{sender} do not contain its {missing[0]} (key v2x.tells), but"
                 f" {', '.join(needs)} of the other vehicles are needed; add them to v2x.tells, or use a policy"
-                " without shield and search, which needs only its observation"
+                " without a shield, which needs only its observation"
             )

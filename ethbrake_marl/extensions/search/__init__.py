@@ -1,1 +1,1 @@
-"""Search for the best commands: best known harm and its tables, the agents ``best_harm`` and ``+search``."""
+"""Search for the best commands: best known harm, its tables, and the agent ``best_harm``."""

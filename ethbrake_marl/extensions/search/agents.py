@@ -1,22 +1,22 @@
-"""Agents that choose all commands at the alert: ``best_harm``, and ``AGENT+search``, which improves another agent's."""
+"""The agent ``best_harm``, which chooses all its commands at the alert."""
 
 from __future__ import annotations
 
 import re
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.agent_names import AgentSettings, make_agent
 from ethbrake_marl.agents.e_v2x_bm import Predicting
-from ethbrake_marl.agents.team import Agent, Team
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MODEL
 from ethbrake_marl.episode.state import FIRST_DECISION, State
-from ethbrake_marl.errors import InvalidInput, Unfamiliar, check_whole_number
+from ethbrake_marl.errors import InvalidInput, Unfamiliar
 from ethbrake_marl.extensions.search.best_harm import (
     SEARCH_BUDGET,
     agent_commands,
@@ -32,7 +32,6 @@ from ethbrake_marl.worlds.open_game import game_of
 from ethbrake_marl.worlds.roles import HOLDING_SCRIPTS, LEARNER
 from ethbrake_marl.worlds.scenario import Scenario
 
-SEARCH_CANDIDATES = 500  # plans that +search simulates
 MOST_CANDIDATES = 1_000_000
 START = {"honest": "plan"}  # name of a count -> agent whose commands ``best_harm`` improves, too
 OTHER_START = "ppo"  # the agent for every other count
@@ -45,27 +44,34 @@ class SearchMemory(NamedTuple):
     predicted_harm: Floats  # [n] m2/s2
 
 
-class Planner(Predicting):
-    """Agent that chooses all its commands at the alert, as if other learners braked fully.
+class BestHarm(Predicting):
+    """Drives the best known commands: from a shipped table, or from a search, as if other learners braked fully.
 
-    If they do, the harm that happens is the memory's ``predicted_harm``, to the last bit.
+    If they do, the harm that happens is the memory's ``predicted_harm``, to the last bit. If it is the only learner, it
+    never does more harm than E-V2X-BM and the agent of ``START``, whose commands are improved once more. Several
+    learners with one objective follow the joint optimum of an ablation: the best known commands of all of them
+    together.
     """
 
     knows = MODEL
 
-    def __init__(self, name: str, scenario: Scenario, harm_count: AnyCount) -> None:
-        self.name, self.scenario, self.harm_count = name, scenario, HarmCount.of(harm_count)
+    def __init__(
+        self, scenario: Scenario, harm_count: AnyCount = HONEST, budget: int = SEARCH_BUDGET, name: str = "best_harm"
+    ) -> None:
+        self.name, self.scenario, self.harm_count, self.budget = name, scenario, HarmCount.of(harm_count), budget
+        self.last_plan: tuple[bytes, SearchMemory] | None = None  # worlds, and plan of all learners, who ask in turn
 
     def begin(self, alert: State, body: int) -> SearchMemory:
         """Choose all commands. Raises ``InvalidInput`` if another vehicle's commands are not known at the alert."""
+        learners = self.scenario.learners
+        is_joint = len(learners) > 1 and body in learners
+        if is_joint and have_one_objective(alert, self.scenario.objective, learners):
+            plan = self.joint_plan(alert)
+            return plan._replace(commands_mps2=plan.commands_mps2[:, :, learners.index(body)])
         game, alert = single_learner_game(self.scenario, alert, body)
         problem = problem_of(game, alert, harm_count=self.harm_count, objective=self.scenario.objective)
         commands, harm = self.choose(game, alert, problem, body)
         return SearchMemory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
-
-    def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        """At all T decisions, [n, T] m/s2, and what they cost, [n] m2/s2."""
-        raise NotImplementedError
 
     def act(self, state: State, memory: SearchMemory, body: int) -> tuple[Floats, SearchMemory]:
         step = np.floor((state.time_s - memory.start_s) / self.scenario.time_step_s + DECISION_ROUNDING).astype(
@@ -73,30 +79,6 @@ class Planner(Predicting):
         )
         at = np.clip(step, 0, memory.commands_mps2.shape[1] - 1)
         return memory.commands_mps2[np.arange(state.n), at], memory
-
-
-class BestHarm(Planner):
-    """Drives the best known commands: from a shipped table, or from a search.
-
-    If it is the only learner, it never does more harm than E-V2X-BM and the agent of ``START``, whose commands are
-    improved once more. Several learners with one objective follow the joint optimum of an ablation: the best known
-    commands of all of them together.
-    """
-
-    def __init__(
-        self, scenario: Scenario, harm_count: AnyCount = HONEST, budget: int = SEARCH_BUDGET, name: str = "best_harm"
-    ) -> None:
-        super().__init__(name, scenario, harm_count)
-        self.budget = budget
-        self.last_plan: tuple[bytes, SearchMemory] | None = None  # worlds, and plan of all learners, who ask in turn
-
-    def begin(self, alert: State, body: int) -> SearchMemory:
-        learners = self.scenario.learners
-        is_joint = len(learners) > 1 and body in learners
-        if not is_joint or not have_one_objective(alert, self.scenario.objective, learners):
-            return super().begin(alert, body)
-        plan = self.joint_plan(alert)
-        return plan._replace(commands_mps2=plan.commands_mps2[:, :, learners.index(body)])
 
     def joint_plan(self, alert: State) -> SearchMemory:
         """[n, T, L] m/s2."""
@@ -125,6 +107,7 @@ class BestHarm(Planner):
             warnings.warn(f"{self.name}: searches every world: {outdated[game.name]}", Unfamiliar, stacklevel=2)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
+        """At all T decisions, [n, T] m/s2, and what they cost, [n] m2/s2."""
         known_harm, profiles = best_stored(problem, self.harm_count)
         commands = profiles.stepwise(int(problem.last_step.max()))[:, :, 0]
         harm = problem.value(problem.follow(profiles))
@@ -149,25 +132,6 @@ class BestHarm(Planner):
         first = np.where(better[:, np.newaxis], commands, best[:, : commands.shape[1]])
         best[:, : commands.shape[1]], harm = refine(problem, first, budget=self.budget)
         return best, harm
-
-
-class SearchAround(Planner):
-    """It never does more harm than the other agent."""
-
-    def __init__(
-        self, inner: Agent, scenario: Scenario, harm_count: AnyCount = HONEST, candidates: int = SEARCH_CANDIDATES
-    ) -> None:
-        check_whole_number("search: candidates", candidates, 1, MOST_CANDIDATES)
-        super().__init__(f"{inner.name}+search", scenario, harm_count)
-        self.inner, self.candidates = inner, candidates
-
-    def check(self, game: Game, body: int) -> None:
-        if hasattr(self.inner, "check"):
-            self.inner.check(game, body)
-
-    def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        start = agent_commands(problem, game, alert, Team(self.inner.name, {body: self.inner}))[:, :, 0]
-        return refine(problem, start, budget=self.candidates)
 
 
 def single_learner_game(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
@@ -200,26 +164,10 @@ def make_best_harm(argument: str | None, settings: AgentSettings) -> BestHarm:
     return BestHarm(settings.needed_scenario(), settings.harm_count, budget, settings.spec)
 
 
-def make_searched(team: Team, argument: str | None, settings: Any) -> Team:
-    if team.shield is not None:
-        raise InvalidInput(
-            f"agent {settings.spec!r}: a search around a shield; write +search first: AGENT+search+SHIELD"
-        )
-    scenario = settings.needed_scenario()
-    drivers = {i: SearchAround(agent, scenario, settings.harm_count) for i, agent in team.drivers.items()}
-    return Team(settings.spec, drivers)
-
-
 BEST_HARM = Part(
     make_best_harm,
     form="best_harm[:CANDIDATES]",
     about="drives the best known profile; searches at the alert if no profile is stored",
-    knows=MODEL,
-)
-SEARCH = Part(
-    make_searched,
-    form="search",
-    about="drives the best commands that a search around the agent's own commands finds at the alert",
     knows=MODEL,
 )
 SEARCH_LADDER = ("best_harm",)  # what `--agents ladder` adds to the core's

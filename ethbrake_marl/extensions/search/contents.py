@@ -2,6 +2,5 @@
 
 CONTENTS = {
     "agents": {"best_harm": "agents:BEST_HARM", "ladder.search": "agents:SEARCH_LADDER"},
-    "shields": {"search": "agents:SEARCH"},
     "measures": {"limits": "limits:LIMITS"},
 }

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
+from ethbrake_marl.errors import PhysicsError, check_whole_number
 from ethbrake_marl.extensions.search.kernels import CHANGE, DRAWING, PLAN, STEPWISE, Field, Room, World, gather, improve
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, UInt64s, best_of
 from ethbrake_marl.motion.layout import Floats, Ints, scratch_for
@@ -179,15 +179,10 @@ def refine(problem: Problem, commands_mps2: Floats, *, budget: int) -> tuple[Flo
 
     The result is at least as good as ``commands_mps2`` [n, T]. Small changes may miss the best commands, so the best of
     some random *templates* (a command, another for a while, then full braking) is improved as well. Raises
-    ``InvalidInput`` for several controlled vehicles, commands that do not fit, or a budget below 1, and
     ``PhysicsError`` for worlds that cannot be simulated.
     """
-    check_whole_number("budget", budget, 1)
-    if len(problem.bodies) != 1:
-        raise InvalidInput(f"vehicles {problem.bodies.tolist()}: plans are searched for one controlled vehicle")
     plans = Profiles.of_steps(commands_mps2[:, :, np.newaxis].copy(), problem.last_step)
     random = random_states(problem.identity, 0)
-    problem.check(plans)
     templates, improvement_budget = int(TEMPLATE_SHARE * budget), int(IMPROVEMENT_SHARE * budget)
     times = ATTENTION_S, LONGEST_CHANGE_S, LONGEST_WHILE_S
     drawing = np.array([PLAN, *(max(int(time / problem.time_step_s + 0.5), 1) for time in times)])

@@ -101,16 +101,6 @@ def test_forecast__by_hand() -> None:
     assert found["brake_first_impact_harm"] == 0.0
 
 
-def test_far__has_the_same_times_and_the_roots_of_harm() -> None:
-    commands = -PAPER.sample(60, 3).car[:, at.BRAKING, 1:]
-    state = later(PAPER.sample(60, 3), commands, 0.9)
-    far = seen(state, 2, view=View(["contact_far"]))
-    for command, own in (("brake", -state.car[:, at.BRAKING, 2]), ("coast", 0.0)):
-        expected = happens(state, 2, own, commands, 0.1)
-        np.testing.assert_allclose(far[f"{command}_front_time"], np.minimum(expected["front_time"], 10.0), rtol=1e-5)
-        np.testing.assert_allclose(far[f"{command}_total_speed"] ** 2, expected["total_harm"], rtol=1e-4, atol=1e-3)
-
-
 def test_who_is_not_known__is_not_forecast_whatever_it_does() -> None:
     scenario = PAPER.replace(v2x="blocked", horizon_s=20, early_impacts="keep")
     state = later(scenario.sample(300, 1), 0.0, 0.6)

@@ -14,7 +14,7 @@ from tests.episode.lines import later, state_of
 pytest.importorskip("ethbrake_marl.extensions.messages")
 
 PIECES = ["place", "speed", "acceleration", "braking_capacity", "latency", "mass"]
-FORECASTS = ["plan", "forecast", "contact", "contact_far"]
+FORECASTS = ["plan", "forecast", "contact"]
 
 
 def without(scenario: Any, piece: str, senders: list[int], **v2x: Any) -> eb.Scenario:
@@ -54,7 +54,7 @@ def test_forecast__waits_until_the_neighbour_can_be_predicted() -> None:
     assert (before["front_1.known"] == 1.0).all() and (before["forecast.known"] == 0.0).all()
     assert (before["plan.action"] == -1.0).all() and (after["forecast.known"] == 1.0).all()
     times = [name for name in before if name.endswith("_time") and "own_" not in name]
-    assert len(times) > 8 and not any(before[name].any() for name in times)
+    assert len(times) == 6 and not any(before[name].any() for name in times)
     assert all(after[name].all() for name in ("contact.brake_front_time", "contact.brake_rear_time"))
     assert (after["plan.action"] > -1.0).any()
 

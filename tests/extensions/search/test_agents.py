@@ -1,4 +1,4 @@
-"""``best_harm`` and ``+search`` do what they predict, never worse than their start; and the measures ``limits``."""
+"""``best_harm`` does what it predicts, never worse than its start; and the measures ``limits``."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,6 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, IMPACT_COUNTS, HarmCount
 from ethbrake_marl.errors import Unfamiliar
-from ethbrake_marl.extensions.search.agents import SearchAround
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.extensions.search.tables import best_stored
@@ -25,10 +24,9 @@ pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.Unfamiliar
     [  # means of README and findings are of these agents
         ("paper-random", "best_harm", 400, "first", 5.5869, 5.6753),
         ("paper-random-obstacle", "best_harm", 200, "total", 25.9747, 28.5609),
-        ("paper-random", "full_brake+search", 400, "first", 8.0593, 8.5959),
     ],
 )
-def test_planners__golden(name: str, agent: str, episodes: int, count: str, first: float, total: float) -> None:
+def test_best_harm__golden(name: str, agent: str, episodes: int, count: str, first: float, total: float) -> None:
     result = eb.evaluate(name, agent, episodes=episodes, harm_count=count)
     own = result[agent]
     assert [own[each.column].mean() for each in IMPACT_COUNTS] == pytest.approx([first, total], abs=5e-5)
@@ -50,15 +48,6 @@ def test_best_harm__of_no_table_is_never_worse_than_its_start_or_e_v2x_bm(count:
     assert result["best_harm:200"]["predicted_harm"].tolist() == best.tolist()
 
 
-@pytest.mark.parametrize(("inside", "count"), [("constant:5", "first"), ("ppo", "honest")])
-def test_search_around__is_never_worse_and_better_with_more_candidates(inside: str, count: str) -> None:
-    agent, column = eb.make_agent(inside, scenario=PAPER), HarmCount.of(count).column
-    agents = {"plain": agent, **{str(n): SearchAround(agent, PAPER, count, n) for n in (20, 200)}}
-    result = eb.evaluate("paper-random", agents, episodes=30, seed=3, harm_count=count)
-    plain, some, many = (result[name][column] for name in agents)
-    assert (some <= plain).all() and (some < plain - 0.1).any() and many.mean() < some.mean()
-
-
 @pytest.mark.parametrize("count", ["honest"])
 @pytest.mark.parametrize(
     ("name", "changes"),
@@ -70,50 +59,42 @@ def test_search_around__is_never_worse_and_better_with_more_candidates(inside: s
         ("cooperation-2-five", {}),
     ],
 )
-def test_planners__in_any_line_keep_what_they_predicted(name: str, changes: dict[str, object], count: str) -> None:
+def test_best_harm__in_any_line_keeps_what_it_predicted(name: str, changes: dict[str, object], count: str) -> None:
     scenario = eb.load_scenario(name).replace(early_impacts="keep", **changes)
-    agents = "full_brake,best_harm:60,full_brake+search"
-    result = eb.evaluate(scenario, agents, episodes=10, seed=4, harm_count=count)
-    for agent in ("best_harm:60", "full_brake+search"):
-        assert result[agent]["predicted_harm"].tolist() == result[agent][HarmCount.of(count).column].tolist()
-    assert (
-        result["full_brake+search"][HarmCount.of(count).column] <= result["full_brake"][HarmCount.of(count).column]
-    ).all()
+    (best,) = eb.evaluate(scenario, "best_harm:60", episodes=10, seed=4, harm_count=count).columns.values()
+    assert best["predicted_harm"].tolist() == best[HarmCount.of(count).column].tolist()
 
 
-def test_planners__minimise_the_objective_of_the_scenario_also_in_worlds_of_a_table() -> None:
-    result = eb.evaluate(
-        PAPER.replace(objective="own"), "best_harm:200,full_brake+search,e_v2x_bm", episodes=10, harm_count="first"
-    )
-    for agent in ("best_harm:200", "full_brake+search"):
-        assert result[agent]["predicted_harm"] == pytest.approx(result[agent]["first_impact_harm_2"], rel=1e-12)
+def test_best_harm__minimises_the_objective_of_the_scenario_also_in_worlds_of_a_table() -> None:
+    result = eb.evaluate(PAPER.replace(objective="own"), "best_harm:200,e_v2x_bm", episodes=10, harm_count="first")
+    best = result["best_harm:200"]
+    assert best["predicted_harm"] == pytest.approx(best["first_impact_harm_2"], rel=1e-12)
     of_the_line = eb.evaluate(PAPER, "best_harm", episodes=10, harm_count="first")["best_harm"]["first_impact_harm_2"]
-    assert result["best_harm:200"]["first_impact_harm_2"].tolist() != of_the_line.tolist()
+    assert best["first_impact_harm_2"].tolist() != of_the_line.tolist()
 
 
-def test_planners__spare_one_vehicle_first_and_then_the_line() -> None:
-    first = PAPER.replace(objective="first:vehicle_3,then:total")
-    result = eb.evaluate(
-        first, "best_harm:200,full_brake,full_brake+search,e_v2x_bm,vine-paper", episodes=10, harm_count="first"
-    )
+def test_best_harm__spares_one_vehicle_first_and_then_the_line() -> None:
+    first = PAPER.replace(objective="weighted:1,1,1000")
+    result = eb.evaluate(first, "best_harm:200,full_brake,e_v2x_bm,vine-paper", episodes=10, harm_count="first")
     goal = {
-        agent: 1000.0 * result[agent]["first_impact_harm_3"] + result[agent]["first_impact_harm"] for agent in result
+        agent: 3.0 * (999.0 * each["first_impact_harm_3"] + each["first_impact_harm"]) / 1002.0
+        for agent, each in result.columns.items()
     }
-    for agent in ("best_harm:200", "full_brake+search"):
-        assert result[agent]["predicted_harm"] == pytest.approx(goal[agent], rel=1e-9)
-        assert result[agent]["first_impact_harm"].mean() < result["full_brake"]["first_impact_harm"].mean()
+    best = result["best_harm:200"]
+    assert best["predicted_harm"] == pytest.approx(goal["best_harm:200"], rel=1e-9)
+    assert best["first_impact_harm"].mean() < result["full_brake"]["first_impact_harm"].mean()
     assert (goal["best_harm:200"] <= goal["vine-paper"] + 1e-9).all()
     assert (goal["best_harm:200"] <= goal["e_v2x_bm"] + 1e-9).all()
 
 
-def test_planners__in_a_role_in_a_team_and_inside_a_shield() -> None:
+def test_best_harm__in_a_role_in_a_team_and_inside_a_shield() -> None:
     roles = {"vehicle_1": "full_brake", "vehicle_2": "best_harm:50", "vehicle_3": "learner"}
     scripted = eb.evaluate(KEPT.replace(roles=roles), "full_brake", episodes=6, seed=4)["full_brake"]
-    alone = eb.evaluate(KEPT, "best_harm:50,full_brake+search+step", episodes=6, seed=4)
+    alone = eb.evaluate(KEPT, "best_harm:50,best_harm:50+step", episodes=6, seed=4)
     assert scripted["honest_cost"] == pytest.approx(alone["best_harm:50"]["predicted_harm"], abs=8.0)
     pair = eb.evaluate("cooperation-3-pair", "best_harm:50,full_brake", episodes=6, seed=4)
     assert pair["best_harm:50"]["honest_cost"].sum() < pair["full_brake"]["honest_cost"].sum()
-    assert alone["full_brake+search+step"]["replaced_actions"].shape == (6,)
+    assert alone["best_harm:50+step"]["replaced_actions"].shape == (6,)
 
 
 @pytest.mark.parametrize(
@@ -123,8 +104,7 @@ def test_planners__in_a_role_in_a_team_and_inside_a_shield() -> None:
 def test_best_harm__of_several_learners_is_the_joint_search(name: str, budget: int, episodes: int) -> None:
     scenario, game = eb.open_game(name)
     worlds = scenario.sample(episodes, seed=7)
-    spec = f"best_harm:{budget}"
-    result = eb.evaluate(name, [spec, "full_brake+search"], episodes=episodes)
+    result = eb.evaluate(name, [f"best_harm:{budget}", "e_v2x_bm"], episodes=episodes)
     together, alone = (result[agent]["honest_cost"] for agent in result)
     problem = problem_of(game, worlds)
     stored = best_stored(problem, HarmCount.of("honest"))[0]
@@ -199,8 +179,8 @@ OTHER_WORLDS = (
 )
 REFUSED: dict[str, Callable[[], object]] = {
     "agent 'best_harm:1.5': after the colon, give the number of profiles": drive(PAPER, "best_harm:1.5"),
-    "'full_brake+step+search': a search around a shield; write +search first": drive(PAPER, "full_brake+step+search"),
-    "vehicle_3 is driven by 'ppo', whose commands are not known at the alert": drive(PLANS, "full_brake+search"),
+    "unknown shield 'search'; known: ": drive(PAPER, "full_brake+search"),
+    "vehicle_3 is driven by 'ppo', whose commands are not known at the alert": drive(PLANS, "best_harm"),
     OTHER_WORLDS: drive(PAPER, "coast", seed=8, measures="limits"),
     NO_TABLE: drive("realistic-platoon", "coast", measures="limits"),
 }
