@@ -69,6 +69,7 @@ SHORT = {  # what is added to a command, the first that fits: the last value of 
     "python train/benchmark/run.py": "--seeds 1 --jobs 1 --decisions 100 --episodes 5",
     "python train/tune.py": "--trials 1 --jobs 1 --set total_steps=1 evaluation.worlds=10",
     "python docs/studies/best_harm.py": "--episodes 2 --budget 20",
+    "python docs/studies/offline_data.py": "--episodes 20",
 }
 
 
