@@ -1,6 +1,10 @@
-"""The offline data set of a task: E-V2X-BM, `plan` and random commands in the worlds of seed 1.
+"""The offline data of a task: what agents observe, do and receive in the worlds of seed 1, for pandas, as Parquet.
 
     python docs/studies/offline_data.py benchmark-single benchmark-single.parquet
+
+An agent's command is a float64 number in m/s2, but a learner's action is a float32 number in [-1, 1]. So each world is
+simulated twice: first the agent drives, and its commands are rounded to actions; then learners take these actions. The
+file contains the second episode. An environment that gets the recorded actions repeats this episode bit for bit.
 
 Prints the SHA-256 of the columns, which does not depend on versions. Use one agent's rows, or all rows as mixed data.
 """
@@ -12,13 +16,16 @@ import hashlib
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet
+import pandas as pd
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.commands import commands_of
+from ethbrake_marl.agent_names import require_learner, teams_of
+from ethbrake_marl.agents.team import Team, play
+from ethbrake_marl.episode.commands import actions_of, commands_of
+from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import NUMBER
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.extensions.datasets import to_parquet
+from ethbrake_marl.files.store import check_target
 
 EPISODES, SEED = 1000, 1
 MOST = 1000  # random actions of an episode
@@ -38,13 +45,39 @@ class Random:
         return commands_of(state, body, actions), memory
 
 
-def digest(path: Path) -> str:
-    """SHA-256 of the columns of a Parquet file, in their order."""
+def rounded_actions(game: Game, alert: eb.State, team: Team) -> list[np.ndarray]:
+    """Commands of a team as float32 actions of the L learners, [n, L] for each decision."""
+    learners = game.settings.learners
+    states = [state for step, state in play(game, alert, team) if step is not None]
+    return [actions_of(state, learners, state.wanted[:, learners]).astype(np.float32) for state in states]
+
+
+def recorded(game: Game, alert: eb.State, team: Team) -> pd.DataFrame:
+    """One row for each world and decision, one episode after the other."""
+    actions, state, frames = rounded_actions(game, alert, team), game.reset(alert), []
+    while not state.ended.all():
+        rows, decision = ~state.ended, int(state.steps.max())
+        observations, action = game.observe(state, game.settings.learners), actions[min(decision, len(actions) - 1)]
+        after, step = game.step(state, action.astype(np.float64))
+        columns = {"agent": team.name, "world": state.clock[:, NUMBER].astype(np.int64), "decision": decision}
+        columns |= {"time_s": state.time_s} | {f"gap_{p}_m": gap for p, gap in enumerate(state.gaps_m.T, 1)}
+        columns |= {f"speed_{i}_mps": speed for i, speed in enumerate(state.speeds_mps.T, 1)}
+        for c, i in enumerate(game.settings.learners.tolist()):
+            features = zip(game.views[i].names, observations[c].T, strict=True)
+            columns |= {f"observation_{i}.{name}": feature for name, feature in features}
+            columns |= {f"action_{i}": action[:, c], f"reward_{i}": step.reward[:, i - 1]}
+        columns |= {"terminated": step.terminated, "truncated": step.truncated}
+        frames.append(pd.DataFrame(columns)[rows])
+        state = after
+    return pd.concat(frames).sort_values("world", kind="stable")
+
+
+def digest(frame: pd.DataFrame) -> str:
+    """SHA-256 of the columns, in their order."""
     total = hashlib.sha256()
-    table = pyarrow.parquet.read_table(path)
-    for name in table.column_names:
-        column = table[name].to_numpy()
-        total.update(name.encode() + ("\n".join(column).encode() if name == "agent" else column.tobytes()))
+    for name, column in frame.items():
+        total.update(str(name).encode())
+        total.update("\n".join(column).encode() if name == "agent" else column.to_numpy().tobytes())
     return total.hexdigest()
 
 
@@ -52,14 +85,20 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", help="name of a scenario, or path of its file")
     parser.add_argument("output", type=Path, help="new Parquet file")
-    parser.add_argument("--episodes", type=int, default=EPISODES, help=f"of each agent (default: {EPISODES})")
+    parser.add_argument(
+        "--agents", default="e_v2x_bm,plan,random", help="agents by name; random draws actions (default: %(default)s)"
+    )
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="of each agent (default: %(default)s)")
     args = parser.parse_args()
-    agents = {name: eb.make_agent(name, scenario=args.task, harm_count="honest") for name in ("e_v2x_bm", "plan")}
     try:
-        to_parquet(
-            args.output, {**agents, "random": Random()}, scenario=args.task, episodes=args.episodes, seed=SEED,
-            reward={"harm": 1.0, "harm_count": "honest"},
-        )  # fmt: skip
+        check_target(args.output)
+        scenario, game = eb.open_game(args.task, reward={"harm": 1.0, "harm_count": "honest"})
+        require_learner(scenario)
+        agents = {name: Random() if name == "random" else name for name in args.agents.split(",")}
+        teams = teams_of(agents, scenario)
+        alert = scenario.sample(args.episodes, SEED)
+        frame = pd.concat([recorded(game, alert, team) for team in teams.values()], ignore_index=True)
+        frame.to_parquet(args.output)
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
-    print(f"{args.output}: SHA-256 of the columns {digest(args.output)}")
+    print(f"{args.output}: SHA-256 of the columns {digest(frame)}")

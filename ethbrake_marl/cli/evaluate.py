@@ -18,7 +18,7 @@ from ethbrake_marl.cli.command import (
     SettingsOption,
 )
 from ethbrake_marl.cli.pages import page_function
-from ethbrake_marl.errors import InvalidInput, need
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.store import check_folder
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 GROUP_EPISODES = 2_000  # worlds of each scenario of a group, except the three tests
 REPORT = "report.html"
 ROWS = "rows.csv"
-FILES = ("results.json", "worlds.csv", "worlds.parquet", ROWS, REPORT)
+FILES = ("results.json", "worlds.csv", ROWS, REPORT)
 
 
 def evaluate_command(
@@ -43,8 +43,8 @@ def evaluate_command(
         Path | None, typer.Option(metavar="FOLDER", help="Also write the results to FOLDER/results.json.")
     ] = None,
     per_world: Annotated[
-        Literal["csv", "parquet"] | None,
-        typer.Option(help="With --output: also write worlds.csv or worlds.parquet, with one row per world and agent."),
+        Literal["csv"] | None,
+        typer.Option(help="With --output: also write worlds.csv, with one row per world and agent."),
     ] = None,
     report: Annotated[
         bool,
@@ -163,7 +163,5 @@ def _check_outputs(out: Out, output: Path | None, names: list[str], per_world: s
             if value:
                 raise InvalidInput(f"{option}: needs a folder for its file; add --output FOLDER")
         return
-    if per_world == "parquet":
-        need("pyarrow")
     for folder in (output, *(output / name for name in names)):
         check_folder(folder, FILES, force=out.force)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput, naming_extras
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.summary import SummaryTable
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
@@ -21,21 +21,19 @@ from ethbrake_marl.files.store import check_target, write_output
 RESULTS, WORLDS = "results.json", "worlds"  # names of files in the folder of an evaluation
 MOST_BYTES = 64 << 20
 
-RowFormat = Literal["csv", "parquet"]
-
 
 def write_results(
     folder: str | Path,
     table: SummaryTable,
     result: Result | None = None,
-    rows: RowFormat | None = None,
+    rows: Literal["csv"] | None = None,
     *,
     name: str = RESULTS,
     force: bool = False,
 ) -> list[Path]:
-    """Write ``FOLDER/NAME`` and, with ``rows``, ``FOLDER/worlds.csv`` or ``.parquet``; return their paths.
+    """Write ``FOLDER/NAME`` and, with ``rows``, ``FOLDER/worlds.csv``; return their paths.
 
-    Raises ``AlreadyExists`` if a file exists, unless ``force``, and ``MissingExtra`` for Parquet without pyarrow.
+    Raises ``AlreadyExists`` if a file exists, unless ``force``.
     """
     target, objects = Path(folder).expanduser(), table.to_json()
     written = [check_target(target / name, force=force)]
@@ -52,29 +50,16 @@ def write_results(
 
 
 def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None:
-    """Write one row per team and world as CSV or Parquet; truth values are 1 and 0, missing values empty."""
-    path, table = Path(path).expanduser(), result.arrays()
+    """Write one row per team and world as CSV; truth values are 1 and 0, missing values empty."""
+    path, table, stream = Path(path).expanduser(), result.arrays(), io.StringIO(newline="")
+    if path.suffix.lower() != ".csv":
+        raise InvalidInput(f"{path}: the name of the file must end in .csv")
     plain = {name: column.astype(np.int64) if column.dtype == np.bool_ else column for name, column in table.items()}
-    stream: Any
-    if path.suffix.lower() == ".parquet":
-        with naming_extras():
-            import pyarrow
-            from pyarrow.parquet import write_table
-        stream = io.BytesIO()
-        write_table(
-            pyarrow.table({name: pyarrow.array(column, from_pandas=True) for name, column in plain.items()}), stream
-        )
-        data = stream.getvalue()
-    elif path.suffix.lower() == ".csv":
-        stream = io.StringIO(newline="")
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(plain)
-        columns = [["" if value != value else value for value in column.tolist()] for column in plain.values()]
-        writer.writerows(zip(*columns, strict=True))
-        data = stream.getvalue().encode()
-    else:
-        raise InvalidInput(f"{path}: the name of the file must end in .csv or .parquet")
-    write_output(path, data, force=force)
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(plain)
+    columns = [["" if value != value else value for value in column.tolist()] for column in plain.values()]
+    writer.writerows(zip(*columns, strict=True))
+    write_output(path, stream.getvalue().encode(), force=force)
 
 
 def read_result(path: str | Path) -> dict[str, dict[str, Any]]:

@@ -69,8 +69,7 @@ def test_in_processes__it_prints_the_same(ethbrake: Command, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("package", "extra", "line"),
-    [("pyarrow", "data", "evaluate --agents coast --episodes 2 --output new --per-world parquet")],
+    ("package", "extra", "line"), [("joblib", "cluster", "evaluate --agents coast --episodes 2 --output new --jobs 2")]
 )
 def test_file__of_an_extra_that_is_missing_says_the_line_that_installs_it(
     ethbrake: Command, package: str, extra: str, line: str, monkeypatch

@@ -15,8 +15,8 @@ USAGE = [
         "No such option: --frobnicate (Possible options: --force) (see: ethbrake evaluate --help)",
     ),
     (
-        "evaluate --per-world txt --output new",
-        "Invalid value for '--per-world': 'txt' is not one of 'csv', 'parquet'. (see",
+        "evaluate --per-world parquet --output new",
+        "Invalid value for '--per-world': 'parquet' is not one of 'csv'. (see",
     ),
 ]
 

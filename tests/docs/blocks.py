@@ -68,6 +68,7 @@ SHORT = {  # what is added to a command, the first that fits: the last value of 
     "python train/tune.py": "--trials 1 --jobs 1 --set total_steps=1 evaluation.worlds=10",
     "python docs/studies/best_harm.py": "--episodes 2 --budget 20",
     "python docs/studies/whose_harm.py": "--worlds 2 --budget 20",
+    "python docs/studies/offline_data.py": "--episodes 20",
 }
 
 

@@ -1,4 +1,4 @@
-"""The scripts of ``train/benchmark``: table, cross-play, data sets, and methods that learn."""
+"""The scripts of ``train/benchmark``: table, cross-play, offline data, and methods that learn."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.benchmark import benchmark_rows, evaluate_task
 from ethbrake_marl.extensions.report.style import picture_bytes
@@ -294,12 +295,39 @@ def test_file__that_cannot_be_written_is_refused_before_the_work(
 def test_data__of_a_task_has_the_same_digest_twice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("pyarrow")
+    pandas = pytest.importorskip("pandas")
     for name in ("one", "two"):
         words = "benchmark-all", str(tmp_path / f"{name}.parquet"), "--episodes", "3"
         run_script(monkeypatch, Path(data.__file__), *words)
     one, two = (line.rpartition(" ")[2] for line in capsys.readouterr().out.splitlines())
-    assert one == two == data.digest(tmp_path / "one.parquet")
+    assert one == two == data.digest(pandas.read_parquet(tmp_path / "one.parquet"))
+
+
+def test_data__replays_bit_for_bit_in_an_environment() -> None:
+    reward = {"harm": 1.0, "jerk": 0.1}
+    scenario, game = eb.open_game("cooperation-3-pair", reward=reward)
+    team = teams_of("e_v2x_bm", scenario)["e_v2x_bm"]
+    rows = iter(data.recorded(game, scenario.sample(4, data.SEED), team).to_dict("records"))
+    env = eb.parallel_env(scenario=scenario, reward=reward)
+    for world in range(4):
+        seen, infos = env.reset(options={"listed_world": {"seed": data.SEED, "number": world}})
+        decision = 0
+        while env.agents:
+            row, actions = next(rows), {}
+            assert (row["agent"], row["world"], row["decision"]) == ("e_v2x_bm", world, decision)
+            assert row["time_s"] == infos["vehicle_1"]["time_s"]
+            assert [row[f"speed_{i}_mps"] for i in (1, 2, 3)] == env.episode.speeds_mps[0].tolist()
+            assert [row[f"gap_{p}_m"] for p in (1, 2)] == env.episode.gaps_m[0].tolist()
+            for i in scenario.learners:
+                observed = [value for name, value in row.items() if name.startswith(f"observation_{i}.")]
+                assert np.array_equal(np.array(observed, np.float32), seen[f"vehicle_{i}"])
+                actions[f"vehicle_{i}"] = np.array([row[f"action_{i}"]], np.float32)
+            seen, rewards, terminated, truncated, infos = env.step(actions)
+            for i in scenario.learners:
+                recorded = row[f"reward_{i}"], row["terminated"], row["truncated"]
+                assert recorded == tuple(each[f"vehicle_{i}"] for each in (rewards, terminated, truncated))
+            decision += 1
+    assert next(rows, None) is None
 
 
 METHODS = [("sb3", "ppo"), ("sb3", "sac"), ("clone", "clone"), ("marl", "ippo"), ("marl", "mappo"), ("marl", "iql")]
