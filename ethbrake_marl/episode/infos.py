@@ -113,23 +113,34 @@ def reward_infos(game: Game, state: State, step: Step | None) -> dict[str, Float
     return {f"reward_{name}": terms[name] for name in reported}
 
 
-def arrays(game: Game, state: State, step: Step | None, seed: Any, bodies: Ints) -> dict[str, Any]:
-    """Infos of the B ``bodies`` in all worlds: name -> a new array [n * B], world by world.
+def dictionaries(game: Game, state: State, step: Step | None, seed: Any, bodies: Ints) -> list[dict[str, Any]]:
+    """Infos of the ``bodies`` in all worlds: a list of dictionaries, one for each world and body, world by world.
 
     ``step`` is None after a reset; cost and terms are then 0. ``seed``: an int for all worlds, or [n].
     """
-    *values, world = numbers(state, bodies).reshape(OUT_ROWS, -1)
-    cost = np.zeros(state.n) if step is None else step.cost
-    seeds = np.full(state.n, seed).repeat(len(bodies))
-    infos = named(values, world.astype(np.int64), cost.repeat(len(bodies)), seeds)
-    return infos | by_body(reward_infos(game, state, step) | game.extra_infos(state), bodies)
+    infos, vehicles = [], len(bodies)
+    seeds = [seed] * state.n if isinstance(seed, int) else seed.tolist()
+    costs = [0.0] * state.n if step is None else step.cost.tolist()
+    others = {name: column.tolist() for name, column in other_infos(game, state, step, bodies).items()}
+    for k, (*values, world) in enumerate(numbers(state, bodies).reshape(OUT_ROWS, -1).T.tolist()):
+        info = named(values, int(world), costs[k // vehicles], seeds[k // vehicles])
+        for name, column in others.items():
+            info[name] = column[k]
+        infos.append(info)
+    return infos
 
 
-def dictionaries(game: Game, state: State, step: Step | None, seed: Any, bodies: Ints) -> list[dict[str, Any]]:
-    """The same as a list of dictionaries with plain numbers, one for each world and body."""
-    columns = arrays(game, state, step, seed, bodies)
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    return [dict(zip(columns, row, strict=True)) for row in rows]
+def arrays(game: Game, state: State, step: Step | None, seed: Any, bodies: Ints) -> dict[str, Any]:
+    """Infos of the body in ``bodies`` [1] in all worlds: name -> a new array [n]. Arguments as in ``dictionaries``."""
+    *values, world = numbers(state, bodies)[:, :, 0]
+    cost = np.zeros(state.n) if step is None else step.cost.copy()
+    infos = named(values, world.astype(np.int64), cost, np.full(state.n, seed))
+    return infos | other_infos(game, state, step, bodies)
+
+
+def other_infos(game: Game, state: State, step: Step | None, bodies: Ints) -> dict[str, Any]:
+    """Infos of the reward, of the shield and of layers, name -> [n * B], as ``by_body`` gives them."""
+    return by_body(reward_infos(game, state, step) | game.extra_infos(state), bodies)
 
 
 def by_body(columns: dict[str, Any], bodies: Ints) -> dict[str, Any]:
