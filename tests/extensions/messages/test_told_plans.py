@@ -11,6 +11,7 @@ from ethbrake_marl.agent_names import AgentSettings, wrap_team
 from ethbrake_marl.episode.counts import HONEST
 from ethbrake_marl.episode.plans import COMMANDS, PLAN_NUMBERS, PLANS_KEY, PlanMemory
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import AgentFailed
 from ethbrake_marl.motion.layout import BRAKING
 
 SHARES = (1.0, 0.0, 0.6, 0.2)  # of its brakes that a teller uses, one decision after the other
@@ -66,10 +67,12 @@ def shielded(scenario: eb.Scenario, agent: Any, mode: str) -> eb.Team:
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("outside", [False, True])
-@pytest.mark.parametrize(("mode", "learners"), [("step", (2,)), ("step", (1, 2)), ("robust:gaps_m.pair_2=0.2", (2,))])
+@pytest.mark.parametrize(
+    ("mode", "learners", "outside"),
+    [("step", (2,), False), ("step", (1, 2), True), ("robust:gaps_m.pair_2=0.2", (2,), False)],
+)
 def test_cost_under_a_shield_whose_agents_tell_plans__is_at_most_the_bound(
-    channel: str, outside: bool, mode: str, learners: tuple[int, ...]
+    channel: str, mode: str, learners: tuple[int, ...], outside: bool
 ) -> None:
     scenario, game = eb.open_game(line(*learners, channel=channel))
     game, rng = shielded(scenario, Teller(), mode).game(game), np.random.default_rng(3)
@@ -102,3 +105,53 @@ def test_agents_of_one_shield__hear_each_others_plans() -> None:
     better = alone.harm() <= last.memories["shield"].first
     assert better.mean() > 0.8 and (last.memories["shield"].replaced[better] == 0).all()
     np.testing.assert_allclose(last.harm()[better], alone.harm()[better], atol=1e-6)
+
+
+class Says(Teller):
+    """Tells one plan from its second decision on, whatever it does."""
+
+    name = "says"
+
+    def __init__(self, plan: list[float]) -> None:
+        self.plan = plan
+
+    def act(self, state: State, memory: PlanMemory, body: int) -> Any:
+        command, memory = super().act(state, memory, body)
+        return command, memory._replace(plan=np.tile(self.plan, (state.n, 1)))
+
+
+@pytest.mark.parametrize(
+    ("kind", "plan"),
+    [*((kind, [1.0, 2.0, np.inf, 0.0, 0.0]) for kind in ("agent", "shielded", "script", "function")),
+     *(("agent", plan) for plan in (
+        [1.0, 2.0, -1.0, np.nan, 0.0], [np.nan, 2.0, -1.0, 0.0, 0.0], [np.nan] * 4 + [0.0], [2.0, 1.0, 0.0, 0.0, 0.0],
+        [-np.inf, 1.0, 0.0, 0.0, 0.0], [np.inf, 1.0, 0.0, 0.0, 0.0], [1.0, 2.0, 0.0], ["brake"] * 5))],
+    ids=str,
+)  # fmt: skip
+def test_plan_that_is_none__is_the_fault_of_who_tells_it(kind: str, plan: list[Any]) -> None:
+    teller: Any = Says(plan)
+    if kind == "function":
+        memory = PlanMemory(np.full((4, len(plan)), np.nan), np.zeros(4))
+        teller = eb.policy_agent(
+            lambda seen, before: (np.zeros(len(seen)), before._replace(plan=np.tile(plan, (len(seen), 1)))),
+            name="says", observation=["own"], initial_state=lambda n: memory,
+        )  # fmt: skip
+    scenario = line(1, 2)
+    team = eb.Team("mine", {1: teller, 2: eb.make_agent("coast")})
+    if kind == "script":
+        eb.register_agent("says", lambda argument, settings: teller)
+        scenario = line(2).replace(roles={"vehicle_1": "says", "vehicle_2": "learner", "vehicle_3": "listening"})
+        team = eb.Team("mine", {2: eb.make_agent("coast")})
+    scenario, game = eb.open_game(scenario)
+    with pytest.raises(AgentFailed, match=r"says.*vehicle_1: tells the plan .* must be 2 times in order, then 3 finite"):
+        list(eb.play(game, scenario.sample(4, 7), eb.shield(team) if kind == "shielded" else team))
+
+
+def test_told_command__is_clipped_to_the_capacity_of_who_tells_it() -> None:
+    features = [f"front_1.plan_command_{phase}" for phase in (1, 2, 3)]
+    scenario, game = eb.open_game(line(1, 2), observation=features)
+    team = eb.Team("mine", {1: Says([1.0, 2.0, 1e9, -1e9, -1.0]), 2: eb.make_agent("coast")})
+    _, state = list(eb.play(game, scenario.sample(4, 7), team))[6]
+    shown = 10.0 * game.observe(state, np.array([2]))[0]
+    capacities = state.driving_capacity_mps2[:, 0], state.braking_capacity_mps2[:, 0]
+    np.testing.assert_allclose(shown, np.stack([capacities[0], -capacities[1], np.full(4, -1.0)], axis=1), rtol=1e-6)
