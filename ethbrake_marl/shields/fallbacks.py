@@ -33,19 +33,19 @@ def first_plans(game: Game, alert: State, state: State, count: HarmCount) -> lis
     """Plans of constant actions from which a shield chooses at the alert, [n, T, L] each.
 
     With one learner: E-V2X-BM. With several: E-V2X-BM of each learner while the others brake fully; the best share of
-    each learner's brakes, chosen one learner after the other; and full braking of all.
+    each learner's brakes, chosen one learner after the other; full braking of all; and E-V2X-BM of all, as the team
+    ``e_v2x_bm`` drives.
     """
-    learners, n, until_s = game.settings.learners, state.n, state.clock[:, END]
+    learners, until_s = game.settings.learners, state.clock[:, END]
     full = alert._replace(wanted=state.wanted.copy())
     full.wanted[:, learners] = -alert.braking_capacity_mps2[:, learners - 1]
-    actions = []
-    for column, body in enumerate(learners.tolist()):
-        action = np.full((n, len(learners)), -1.0)
-        action[:, column] = actions_of(alert, body, -coupled(full, body, count, until_s).deceleration_mps2)
-        actions.append(action)
+    choices = [coupled(full, body, count, until_s) for body in learners.tolist()]
+    best = actions_of(alert, learners, -np.stack([choice.deceleration_mps2 for choice in choices], axis=1))
+    actions = [best]
     if len(learners) > 1:
         commands, _ = descend(state, learners.tolist(), BRAKE_SHARES, FALLBACK_ROUNDS, until_s, count)
-        actions += [actions_of(alert, learners, commands[:, learners]), np.full((n, len(learners)), -1.0)]
+        alone = [np.where(column, best, -1.0) for column in np.eye(len(learners), dtype=np.bool_)]
+        actions = [*alone, actions_of(alert, learners, commands[:, learners]), np.full(best.shape, -1.0), best]
     return [constant_plans(game, action) for action in actions]
 
 
