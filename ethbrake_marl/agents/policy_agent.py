@@ -25,7 +25,7 @@ from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
 from ethbrake_marl.episode.counts import COUNTS, HarmCount
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.layer import MESSAGES, Observer, observe_through
+from ethbrake_marl.episode.layer import MESSAGES, Observer, check_seen, observe_through
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import NUMBER, State, map_arrays
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar
@@ -117,6 +117,7 @@ class LearnedAgent(RangeObserver):
         return HarmCount.of(name) if name in COUNTS else name
 
     def observe(self, view: View, state: State, body: int) -> Observations:
+        check_seen(self, state, body)
         return observe_through(self.layers, view, state, body, self.policy.manifest.time_step_s)
 
 
@@ -162,6 +163,7 @@ class PolicyAgent(RangeObserver):
         return commands_of(state, body, actions), memory
 
     def observe(self, view: View, state: State, body: int) -> Observations:
+        check_seen(self, state, body)
         return observe_through(self.layers, view, state, body, self.time_step_s)
 
     def _own(self, memory: Any, n: int) -> Any:

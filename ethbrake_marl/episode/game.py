@@ -11,7 +11,7 @@ import numpy as np
 from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.commands import proposal_array
 from ethbrake_marl.episode.departures import departures_of
-from ethbrake_marl.episode.layer import Layer, agent_through, observe_through, see_through
+from ethbrake_marl.episode.layer import TRUE_STATE, Layer, agent_through, observe_through, see_through
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.script_calls import ask_scripts, begin_script
@@ -219,6 +219,8 @@ class Game(NamedTuple):
             state = self.physics.first_decision(self._replace(layers=()), alert)
         else:
             state = one_step.first_decision(alert, self.deciders, self.settings)
+        if self.layers:
+            state = state._replace(memories={**state.memories, TRUE_STATE: None})
         for layer in self.layers:
             state = layer.first_decision(self, alert, state)
         return state

@@ -26,6 +26,7 @@ MODEL = "true model"  # also masses, restitution and scripts: everything that an
 KNOWLEDGE = (SENSORS, MESSAGES, ESTIMATED, STATE, MODEL)
 UNSTATED = "not stated"
 UNFILTERED = (STATE, MODEL)  # only who says so sees the true state; layers filter all other agents
+TRUE_STATE = "true state"  # memory (None) of the true state of a game with layers; what vehicles see has none
 
 
 class Layer:
@@ -119,9 +120,19 @@ class Observer:
 
     def predictable(self, state: State, body: int) -> State:
         """The state for a forecast by vehicle ``body``, through all layers."""
+        check_seen(self, state, body)
         for layer in self.layers:
             state = see_through(layer, state, body, "predictable")
         return state
+
+
+def check_seen(agent: Any, state: State, body: int) -> None:
+    """Raise ``InvalidInput`` if an agent that has no layers would act on the true state of a game with layers."""
+    if TRUE_STATE in state.memories and not getattr(agent, "layers", ()):
+        raise InvalidInput(
+            f"agent {name_of(agent)!r}: this is the true state, of which vehicle_{body} sees only a part; call"
+            f" game.agents({{{body}: agent}})[{body}].act(state, memory, {body}), which sees what the vehicle sees"
+        )
 
 
 def see_through(layer: Layer, state: State, body: int, method: str = "seen") -> State:
@@ -135,7 +146,7 @@ def see_through(layer: Layer, state: State, body: int, method: str = "seen") -> 
         raise InvalidInput(f"{what}: {method} fails: {describe_error(error)}") from error
     if not isinstance(view, State) or view.line.shape != state.line.shape:
         raise InvalidInput(f"{what}: {method} must return a State of the same {state.n} worlds and vehicles")
-    return view
+    return view._replace(memories={name: memory for name, memory in view.memories.items() if name != TRUE_STATE})
 
 
 def observe_through(layers: tuple[Layer, ...], view: View, state: State, body: int, time_step_s: float) -> Observations:

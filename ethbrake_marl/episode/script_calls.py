@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.episode.plans import PHASES, PlanMemory, are_plans
 from ethbrake_marl.episode.state import NUMBER, State, arrays_of, map_arrays
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, describe_error
 from ethbrake_marl.motion.forces import capacities
@@ -96,7 +97,9 @@ def name_of(script: Any) -> str:
 
 def begin_script(script: Any, alert: State, body: int) -> Any:
     """Memory of a script at the ``alert`` of new episodes. Raises ``AgentFailed`` if the script fails."""
-    return _call(script, "begin", alert, body)
+    memory = _call(script, "begin", alert, body)
+    _check_plan(script, memory, body)
+    return memory
 
 
 def ask_script(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
@@ -105,6 +108,7 @@ def ask_script(script: Any, state: State, memory: Any, body: int) -> tuple[Float
     Raises ``AgentFailed`` if the script fails, or if its commands are not numbers or exceed a capacity.
     """
     answer, memory = _call(script, "act", state, memory, body)
+    _check_plan(script, memory, body)
     try:
         commands = np.asarray(answer)
     except ValueError:  # lists of different lengths
@@ -135,6 +139,14 @@ def ask_scripts(scripts: Mapping[int, Any], state: State) -> State:
         commands, memories[i] = ask_script(script, state, memories[i], i)
         np.copyto(wanted[:, i], commands, where=running)
     return state._replace(wanted=wanted, memories=memories)
+
+
+def _check_plan(script: Any, memory: Any, body: int) -> None:
+    """Raise ``AgentFailed`` if a script tells what is no plan."""
+    if isinstance(memory, PlanMemory) and not (good := are_plans(memory.plan)).all():
+        right = f"must be {PHASES - 1} times in order, then {PHASES} finite commands; or only NaN, if there is no plan"
+        told = memory.plan[np.argmin(good)].tolist()
+        raise AgentFailed(name_of(script), None, f"vehicle_{body}: tells the plan {told}; {right}")
 
 
 def _call(script: Any, method: str, state: State, *arguments: Any) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
-from ethbrake_marl.agents.team import Agent, propose
+from ethbrake_marl.agents.team import Agent
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
@@ -26,7 +26,7 @@ from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shields.fallbacks import constant_plans, rollout
+from ethbrake_marl.shields.fallbacks import AGENTS, ask_agents, constant_plans, rollout
 from ethbrake_marl.shields.shield import NamedShield, check_drivers, checked_drivers, report_of, spread
 
 ACTION_ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the applied action
@@ -79,7 +79,7 @@ class EpisodeShield:
         choice = coupled(worlds, body, self.harm_count, state.clock[:, END]) if self.coupled else pairwise(worlds, body)
         backup = actions_of(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
         held_back = constant_plans(game, backup)
-        policy_state = state._replace(memories={**state.memories, body: remembered})
+        policy_state = state._replace(memories={**state.memories, AGENTS: {body: remembered}})
         policy_harm = price(
             game, state, rollout(game, self.drivers, policy_state, held_back, self.harm_count), self.harm_count
         )
@@ -95,7 +95,7 @@ class EpisodeShield:
     ) -> tuple[Floats, EpisodeShieldMemory]:
         memory: EpisodeShieldMemory = state.memories["shield"]
         (body,) = self.drivers
-        policy_actions, after = propose(game.agents(self.drivers), state, {body: memory.agent})
+        policy_actions, after = ask_agents(game.agents(self.drivers), state, {body: memory.agent})
         proposed = policy_actions if proposed is None else np.where(np.isnan(proposed), policy_actions, proposed)
         applied = np.where(memory.chosen[:, np.newaxis], policy_actions, memory.backup)
         differ = (np.abs(applied - proposed) > ACTION_ROUNDING) & ~state.ended[:, np.newaxis]

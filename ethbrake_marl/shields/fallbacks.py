@@ -25,6 +25,7 @@ from ethbrake_marl.motion.layout import BRAKING, Floats
 BRAKE_SHARES = np.linspace(0.0, 1.0, 21)  # shares of its brakes that each of several learners tries at the alert
 FALLBACK_ROUNDS = 2  # rounds in which the learners take turns to try them
 CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4])  # added to the plan's next actions, then held
+AGENTS = "agents"  # memory of a state: the memories of the shield's agents, vehicle -> memory
 SINGLE_ACTIONS = np.linspace(0.0, -1.0, 4)  # actions of one of several learners, tried while the others follow the plan
 
 
@@ -32,19 +33,19 @@ def first_plans(game: Game, alert: State, state: State, count: HarmCount) -> lis
     """Plans of constant actions from which a shield chooses at the alert, [n, T, L] each.
 
     With one learner: E-V2X-BM. With several: E-V2X-BM of each learner while the others brake fully; the best share of
-    each learner's brakes, chosen one learner after the other; and full braking of all.
+    each learner's brakes, chosen one learner after the other; full braking of all; and E-V2X-BM of all, as the team
+    ``e_v2x_bm`` drives.
     """
-    learners, n, until_s = game.settings.learners, state.n, state.clock[:, END]
+    learners, until_s = game.settings.learners, state.clock[:, END]
     full = alert._replace(wanted=state.wanted.copy())
     full.wanted[:, learners] = -alert.braking_capacity_mps2[:, learners - 1]
-    actions = []
-    for column, body in enumerate(learners.tolist()):
-        action = np.full((n, len(learners)), -1.0)
-        action[:, column] = actions_of(alert, body, -coupled(full, body, count, until_s).deceleration_mps2)
-        actions.append(action)
+    choices = [coupled(full, body, count, until_s) for body in learners.tolist()]
+    best = actions_of(alert, learners, -np.stack([choice.deceleration_mps2 for choice in choices], axis=1))
+    actions = [best]
     if len(learners) > 1:
         commands, _ = descend(state, learners.tolist(), BRAKE_SHARES, FALLBACK_ROUNDS, until_s, count)
-        actions += [actions_of(alert, learners, commands[:, learners]), np.full((n, len(learners)), -1.0)]
+        alone = [np.where(column, best, -1.0) for column in np.eye(len(learners), dtype=np.bool_)]
+        actions = [*alone, actions_of(alert, learners, commands[:, learners]), np.full(best.shape, -1.0), best]
     return [constant_plans(game, action) for action in actions]
 
 
@@ -92,18 +93,26 @@ def write_candidates(car, clock, learners, plans, changes, single_actions, actio
                 commands[row, j, c] = action * capacity(car[row], BRAKING, learners[c])
 
 
+def ask_agents(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
+    """Actions of a shield's agents, [n, L], and their new ``memories``.
+
+    Only these agents hear each other's plans. Nobody else does, because a shield may apply other actions.
+    """
+    return propose(drivers, state._replace(memories={**state.memories, **memories}), memories)
+
+
 def rollout(
     game: Game, drivers: Mapping[int, Agent], state: State, plans: Floats, count: HarmCount, most: Any = np.inf
 ) -> Floats:
     """Copy of ``plans`` [n, T, L] with the actions that agents choose from ``state`` on.
 
     Agents drive until the episode ends or its harm is above ``most`` [n] (m2/s2). ``drivers``: vehicle -> agent;
-    ``state`` contains the agents' memories.
+    ``state`` contains the agents' memories (``AGENTS``).
     """
     plans, rows, drivers = plans.copy(), np.arange(state.n), game.agents(drivers)
     while (~state.ended & (state.harm(count) <= most)).any():
-        actions, memories = propose(drivers, state, state.memories)
+        actions, memories = ask_agents(drivers, state, state.memories[AGENTS])
         now = np.minimum(state.steps, plans.shape[1] - 1)
         plans[rows, now] = actions
-        state, _ = game.follow(state._replace(memories=memories), actions)
+        state, _ = game.follow(state._replace(memories={**state.memories, AGENTS: memories}), actions)
     return plans

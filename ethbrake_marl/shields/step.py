@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.team import Agent, propose
+from ethbrake_marl.agents.team import Agent
 from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MODEL
@@ -47,7 +47,7 @@ from ethbrake_marl.episode.state import State, take
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
+from ethbrake_marl.shields.fallbacks import AGENTS, ask_agents, best_constant, first_plans, rollout
 from ethbrake_marl.shields.shield import NamedShield, ShieldReason, check_drivers, checked_drivers, report_of, spread
 
 NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
@@ -166,7 +166,7 @@ class StepShield:
         caps = follow_plans(game, state, plan, self.harm_count)[0].borne_harm(self.harm_count) if self.cap else None
         if agents:
             check_drivers(game, agents)
-            agent_plan = self.rolled_out(game, state._replace(memories={**state.memories, **agents}), plan)
+            agent_plan = self.rolled_out(game, state._replace(memories={**state.memories, AGENTS: agents}), plan)
             value = self.price(game, states, agent_plan, caps=caps)
             better = value <= harm
             plan[better], harm[better] = agent_plan[better], value[better]
@@ -219,7 +219,7 @@ class StepShield:
         applied = memory.plan[worlds, decision]
         differ = running & (applied != proposed)
         return applied, memory._replace(
-            agents=tuple(state.memories[body] for body in self.drivers), proposed=proposed, applied=applied,
+            agents=tuple(state.memories[AGENTS].values()), proposed=proposed, applied=applied,
             intervened=spread(game, state, differ, False), replaced=memory.replaced + differ.sum(axis=1), reason=reason,
             margin=margin,
         )  # fmt: skip
@@ -239,9 +239,9 @@ class StepShield:
         if agent_memories and (
             np.isnan(proposed).any() or any(memory is not None for memory in agent_memories.values())
         ):
-            agent_actions, agent_memories = propose(game.agents(self.drivers), state, agent_memories)
+            agent_actions, agent_memories = ask_agents(game.agents(self.drivers), state, agent_memories)
             proposed = np.where(np.isnan(proposed), agent_actions, proposed)
-        return proposed, state._replace(memories={**memories, **agent_memories})
+        return proposed, state._replace(memories={**memories, AGENTS: agent_memories})
 
     def accept(
         self,

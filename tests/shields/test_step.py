@@ -98,11 +98,22 @@ def test_at_the_alert_the_bound_is_the_cheapest_first_plan() -> None:
     alert = scenario.sample(10, 7)
     state = game._replace(shield=StepShield()).reset(alert)
     harms = [price(game, state, plan, HONEST) for plan in first_plans(game, alert, state, HONEST)]
-    assert len(harms) == 4  # E-V2X-BM of each, the descent, full braking; one learner: E-V2X-BM alone
+    assert len(harms) == 5  # E-V2X-BM of each, the descent, full braking, E-V2X-BM of all; one learner: E-V2X-BM alone
     _, alone = open_game("paper-random")
     assert len(first_plans(alone, alert, state, HONEST)) == 1
     assert (state.memories["shield"].price == np.min(harms, axis=0)).all()
-    assert (state.memories["shield"].price <= harms[-1]).all()
+    assert (state.memories["shield"].price <= harms[-2]).all()
+
+
+@pytest.mark.parametrize("name", ["pair", "five", "build-up, all"])
+@pytest.mark.parametrize("count", ["honest", "first"])
+def test_the_bound_of_several_learners__is_at_most_the_harm_of_the_team_e_v2x_bm(name: str, count: str) -> None:
+    scenario, game = open_game(LINES[name]())
+    alert = scenario.sample(60, 7)
+    agent = make_agent("e_v2x_bm", scenario=scenario, harm_count=count)
+    team = Team("all", dict.fromkeys(scenario.learners, agent))
+    bound = game._replace(shield=StepShield(harm_count=count)).reset(alert).memories["shield"].price
+    assert (bound <= play_to_end(game, alert, team).harm(count) + 1e-6).all()
 
 
 # ------------------------------------------------------------------------------------------------ properties

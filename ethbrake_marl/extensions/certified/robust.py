@@ -23,7 +23,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.motion.layout import GAP, IMPACTS, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shields.fallbacks import constant_plans
+from ethbrake_marl.shields.fallbacks import AGENTS, constant_plans
 from ethbrake_marl.shields.shield import NamedShield
 from ethbrake_marl.shields.step import StepShield, StepShieldMemory
 
@@ -71,8 +71,7 @@ class RobustShield(StepShield):
         """The possible states of each world: its nominal state, then the corners; [n M, ...] in all."""
         states = join_members(memory.members.states)
         rows = np.arange(state.n).repeat(states.n // state.n)
-        agent_memories = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}
-        return states._replace(memories={**states.memories, **agent_memories})
+        return states._replace(memories={**states.memories, AGENTS: take(state.memories[AGENTS], rows)})
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
         """Harm of each plan in the worst of the M possible states of its world, [n] m2/s2. ``caps`` is unused."""

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.layer import MESSAGES
+from ethbrake_marl.episode.layer import MESSAGES, check_seen
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
@@ -249,6 +249,7 @@ class Controller:
         If the law notices dangers, the vehicle coasts while there is none. Between perception and the end of the
         reaction time it decelerates by at least ``release`` (m/s2).
         """
+        check_seen(self, state, body)
         motion, p = KnownMotion.of(state, body, self.step_s), self.parameters
         command = self.law.command(motion, p)
         if self.law.notices is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.episode.layer import MESSAGES
+from ethbrake_marl.episode.layer import MESSAGES, check_seen
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
@@ -19,6 +19,7 @@ class Synchronised:
         return None
 
     def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
+        check_seen(self, state, body)
         known = state.know[:, body, 1:] <= state.time_s[:, np.newaxis]
         known[:, body - 1] = True
         instant = np.where(known & np.isfinite(state.latency_s), state.latency_s, 0.0).max(axis=1)

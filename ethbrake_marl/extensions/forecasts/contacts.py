@@ -79,7 +79,7 @@ def known_line(line, car, clock, know, i, observer_line, parameters, commands):
 
     ``line`` and ``car`` of the world, as ``clock`` and ``know`` in ``State``, are copied to ``observer_line`` and
     ``parameters``. The assumed commands (m/s2) are written to ``commands`` [N + 1]. Unknown bodies are at rest and out
-    of reach.
+    of reach, and like body i in all else.
     """
     first, last, time, predicts = i, i, clock[TIME], know[i, i] < math.inf
     nearest, farthest = row_within_reach(line, car, clock, know, i)
@@ -88,18 +88,18 @@ def known_line(line, car, clock, know, i, observer_line, parameters, commands):
     while predicts and last < farthest and time >= know[i, last + 1]:
         last += 1
     for j in range(line.shape[1]):
-        for row in range(CAR_ROWS):
-            parameters[row, j] = car[row, j]
-        parameters[SCRIPTED, j] = 0.0  # the assumed commands are nobody's script
         inside, force = first <= j <= last, line[FORCE, j]
+        for row in range(CAR_ROWS):  # the values of an unknown vehicle would cause other events, and other rounding
+            parameters[row, j] = car[row, j if inside or j == 0 else i]
+        parameters[SCRIPTED, j] = 0.0  # the assumed commands are nobody's script
         observer_line[SPEED, j] = line[SPEED, j] if inside else 0.0
         observer_line[FORCE, j] = force if inside else 0.0
         observer_line[GAP, j] = line[GAP, j] if first <= j < last else FAR_M
         observer_line[HIT, j] = line[HIT, j]
         parameters[LATENCY, j], commands[j] = 0.0, force if inside else 0.0
-        if j == i or force == 0.0:
+        if j == i or (inside and force == 0.0):
             parameters[LATENCY, j] = max(car[OWN_LATENCY, j] - time, 0.0)
-            commands[j] = -capacity(car, BRAKING, j) if inside else 0.0
+            commands[j] = -capacity(car, BRAKING, j)
         elif inside and force < 0.0 and car[BRAKE_RATE, j] < math.inf:
             commands[j] = -capacity(car, BRAKING, j)
     if predicts and first == 1 and line[GAP, 0] < FAR_M:

@@ -78,9 +78,8 @@ def foresee_worlds(line, car, clock, know, plans, i, forecast):
             for p in range(PHASES - 1):
                 commands[p + 1, j], ends[p, j] = commands[0, j], math.inf
             if max(first, 1) <= j <= last and not math.isnan(plans[k, 0, j]):
-                most = capacity(car[k], BRAKING, j)
                 for p in range(PHASES):
-                    commands[p, j] = max(plans[k, PHASES - 1 + p, j], -most)
+                    commands[p, j] = plans[k, PHASES - 1 + p, j]
                 for p in range(PHASES - 1):
                     ends[p, j] = max(plans[k, p, j] - clock[k, TIME], 0.0)
 

@@ -44,7 +44,7 @@ from ethbrake_marl.motion.layout import (
 )
 
 LINE_PIECES = {SPEED: P_SPEED, FORCE: P_ACCELERATION}  # row of `State.line` -> the piece that it is
-CAR_PIECES = {
+CAR_PIECES = {  # the same of `State.car`; all vehicles know the other rows, such as restitution, of all
     BRAKING: P_BRAKING,
     DRIVING: P_BRAKING,
     BRAKE_RATE: P_BRAKING,

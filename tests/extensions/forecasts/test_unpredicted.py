@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,25 @@ def test_who_knows_nobody__brakes_fully() -> None:
     nobody = (state.know[:, 2, [1, 3]] > 0.6).all(axis=1)
     action = View(["plan.action"]).observe(state, np.array([2]), 0.1)[:, 0, 0]
     assert 10 < nobody.sum() < 290 and (action[nobody] == -1.0).all() and (action[~nobody] > -1.0).any()
+
+
+def test_plan__does_not_depend_on_vehicles_of_which_its_own_knows_nothing() -> None:
+    scenario = eb.load_scenario("cooperation-3-five")
+    scenario = scenario.replace(v2x={"preset": "nominal", "hears": "front", "senses": "front"})
+    _, game = eb.open_game(scenario)
+    agent, rng = replace(eb.make_agent("plan", scenario=scenario), candidates=60), np.random.default_rng(3)
+    state, compared = game.reset(scenario.sample(12, 11)), 0
+    for _ in range(6):
+        for body in (3, 4):
+            unknown = state.know[:, [body]] > state.time_s[:, np.newaxis, np.newaxis]
+            unknown[:, :, body] = False
+            other = state._replace(car=np.where(unknown, rng.uniform(1.0, 9.0, state.car.shape), state.car))
+            answers = [agent.act(worlds, agent.begin(worlds, body), body) for worlds in (state, other)]
+            np.testing.assert_array_equal(*(command for command, _ in answers))
+            np.testing.assert_array_equal(*(memory.plan for _, memory in answers))
+            compared += unknown.any(axis=(1, 2)).sum()
+        state, _ = game.step(state, rng.uniform(-1.0, 0.0, (12, len(game.settings.learners))))
+    assert compared > 100
 
 
 def test_vehicle_1__plans_alone_for_an_obstacle() -> None:

@@ -9,6 +9,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.episode import layer
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluate import hidden_from
 from ethbrake_marl.worlds.open_game import game_of
 
@@ -114,6 +115,32 @@ def speeds_seen(knows: str) -> list[float]:
     agent = Seeing(knows, share=1.0)
     list(eb.play(game, scenario.sample(1, 7), eb.Team("one", {2: agent})))
     return agent.states[1].speeds_mps[0].round(3).tolist()
+
+
+class Nothing(layer.Layer):
+    """Lets everything through."""
+
+
+BY_HAND = {
+    "a rule": ("plan", "forecasts"), "a controller": ("idm", "field"), "a platoon": ("synchronised", "field"),
+    "a policy": ("ppo", "messages"), "a function": (lambda seen: -seen[:, 0].clip(0, 1), "messages"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BY_HAND)
+@pytest.mark.parametrize("name", ["messages-noisy", "paper-random"])
+def test_agent_called_by_hand__is_refused_the_true_state_of_a_game_with_layers(what: str, name: str) -> None:
+    policy, extension = BY_HAND[what]
+    pytest.importorskip(f"ethbrake_marl.extensions.{extension}")
+    scenario, game = eb.open_game(name)
+    game = game if game.layers else game.with_layers([Nothing()])
+    agent = eb.policy_agent(policy, scenario=name) if callable(policy) else eb.make_agent(policy, scenario=scenario)
+    alert = scenario.sample(3, 7)
+    state = game.step(game.reset(alert), np.full((3, 1), -0.5))[0]
+    memory = agent.begin(alert, 2)
+    with pytest.raises(InvalidInput, match=r"is the true state, .*game\.agents\(\{2: agent\}\)\[2\]\.act"):
+        agent.act(state, memory, 2)
+    assert game.agents({2: agent})[2].act(state, memory, 2)[0].shape == (3,)
 
 
 def test_a_silent_agent__sees_noisy_messages() -> None:
