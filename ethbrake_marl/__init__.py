@@ -103,7 +103,7 @@ if TYPE_CHECKING:
 __version__ = "3.0.0"
 
 
-_HOMES = names_behind(__file__)
+_HOMES = names_behind(__name__)
 _NEED_TRAIN = ("EthBrakeVecEnv", "TrainResult", "make_sb3_vec_env", "resume", "train")
 
 

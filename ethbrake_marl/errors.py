@@ -150,7 +150,8 @@ def need(package: str) -> None:
 
 
 def _missing(package: str) -> MissingExtra:
-    line = f"{sys.executable} -m pip install 'ethbrake-marl[{EXTRA_OF[package]}]'"
+    pip = f"{sys.executable} -m pip install" if find_spec("pip") else f"uv pip install --python {sys.executable}"
+    line = f"{pip} 'ethbrake-marl[{EXTRA_OF[package]}]'"
     return MissingExtra(f"needs the package {package}, which is not installed; install it with: {line}")
 
 

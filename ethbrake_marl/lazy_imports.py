@@ -1,35 +1,39 @@
 """Lazy imports: the ``__init__`` of a folder lists public names; a name is imported at its first use.
 
 The list is a block of imports under ``if TYPE_CHECKING``, which type checkers understand. This module reads the list
-from the source file.
+from the compiled code of the ``__init__``: a zip file, or a program made by PyInstaller, has no source file.
 """
 
 from __future__ import annotations
 
-import ast
+import dis
 import sys
 from collections.abc import Callable
-from functools import cache
 from importlib import import_module
-from pathlib import Path
+from itertools import dropwhile
 from typing import Any
 
-
-@cache
-def names_behind(file: str) -> dict[str, str]:
-    """Public name -> module that defines it, from the ``if TYPE_CHECKING`` block of the ``__init__.py`` at ``file``."""
-    statements = ast.parse(Path(file).read_text("utf-8")).body
-    block = next(statement for statement in statements if isinstance(statement, ast.If)).body
-    imports = [statement for statement in block if isinstance(statement, ast.ImportFrom)]
-    return {alias.name: str(statement.module) for statement in imports for alias in statement.names}
+BLOCK = "LOAD_NAME", "TYPE_CHECKING"  # the instruction before the block
 
 
-def front_door(package: str, file: str) -> Callable[[str], Any]:
+def names_behind(package: str) -> dict[str, str]:
+    """Public name -> module that defines it, from the ``if TYPE_CHECKING`` block of the package's ``__init__``."""
+    code = sys.modules[package].__spec__.loader.get_code(package)  # type: ignore[union-attr]  # every loader has it
+    names, home = dict[str, str](), ""
+    for each in dropwhile(lambda each: (each.opname, each.argval) != BLOCK, dis.get_instructions(code)):
+        if each.opname == "IMPORT_NAME":
+            home = each.argval
+        elif each.opname == "IMPORT_FROM":
+            names[each.argval] = home
+    return names
+
+
+def front_door(package: str) -> Callable[[str], Any]:
     """Set ``__all__`` and ``__dir__`` of a package; return its ``__getattr__``, which imports a name at its first use.
 
-    ``package`` and ``file`` are ``__name__`` and ``__file__`` of the package's ``__init__``.
+    ``package`` is the ``__name__`` of the package's ``__init__``.
     """
-    folder, names = sys.modules[package], names_behind(file)
+    folder, names = sys.modules[package], names_behind(package)
     vars(folder).update(__all__=[*names], __dir__=lambda: sorted({*vars(folder), *names}))
 
     def import_name(name: str) -> Any:

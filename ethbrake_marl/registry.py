@@ -12,12 +12,13 @@ name is first used, the entry point is loaded and its value is passed to the ``r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from importlib.resources import files
+from importlib.util import find_spec
 from operator import attrgetter
+from pkgutil import iter_modules
 from threading import RLock
 from typing import Any, TypeVar
 
@@ -69,15 +70,21 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def package_points(group: str) -> list[EntryPoint]:
-    """Those in the files ``contents.py``."""
+    """Those in the modules ``contents``."""
     package = __name__.rpartition(".")[0]
-    folder = files(package) / "extensions"
-    extensions = [path.name for path in folder.iterdir() if (path / "contents.py").is_file()] if folder.is_dir() else []
+    extensions = f"{package}.extensions"
+    folders = [] if find_spec(extensions) is None else import_module(extensions).__path__
+    names = [name for _, name, _ in iter_modules(folders) if "contents" in modules_in(folders, name)]
     part_points = []
-    for place in (package, *(f"{package}.extensions.{name}" for name in extensions)):
+    for place in (package, *(f"{extensions}.{name}" for name in names)):
         table = import_module(f"{place}.contents").CONTENTS.get(group, {})
         part_points += [EntryPoint(name, f"{place}.{value}", group) for name, value in table.items()]
     return part_points
+
+
+def modules_in(folders: Iterable[str], name: str) -> list[str]:
+    """Names of the modules of a package called ``name``, which is not imported."""
+    return [module for _, module, _ in iter_modules([f"{folder}/{name}" for folder in folders])]
 
 
 def giver(point: EntryPoint) -> str:

@@ -6,6 +6,9 @@ from typing import Any, assert_type
 import numpy as np
 
 import ethbrake_marl as eb
+from ethbrake_marl.training.ppo import Ppo
+from ethbrake_marl.training.recipe import PpoRecipe
+from ethbrake_marl.training.training import Training
 
 
 class Cautious:
@@ -49,6 +52,21 @@ class Fog(eb.ChannelKey):
         return eb.Layer()
 
 
+class PatientRecipe(PpoRecipe):
+    algorithm: str = "patient"
+    patience: float = 0.995
+
+
+class Patient(Ppo):
+    """A learning algorithm of one's own."""
+
+    def build(self, training: Training, environment: eb.EthBrakeVecEnv) -> Any:
+        model, recipe = super().build(training, environment), training.recipe
+        assert isinstance(recipe, PatientRecipe)
+        model.gamma = model.rollout_buffer.gamma = recipe.patience
+        return model
+
+
 def weigh(count: eb.HarmCount) -> float:
     eb.register_count("pushes", [0, 1, 0, 10, 0, 0], column="pushes_cost", words="cost of pushes")
     return sum(count.weights)
@@ -76,6 +94,7 @@ def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str
     eb.register_agent("cautious", make_cautious)
     eb.register_shield("bare", unshielded)
     eb.register_algorithm("own", recipe, algorithm)
+    eb.register_algorithm("patient", PatientRecipe, Patient)
     eb.register_term("smooth", smooth, unit="m/s2")
     eb.register_feature("load", lambda state, body: state.mass_t[:, body - 1], unit="t", scale=10.0, low=0.0, high=6.0)
     eb.register_feature_group("loads", [], lambda state, bodies, time_step_s: state.mass_t[:, bodies - 1, np.newaxis])
@@ -107,6 +126,7 @@ def play_by_hand() -> float:
     assert_type(scenario, eb.Scenario)
     assert_type(game, eb.Game)
     worlds: eb.State = scenario.sample(10, 7)
+    state = game.reset(game.draw(10, seed=7, first=0))
     state = game.reset(worlds)
     harm = eb.price(game, state, np.full((10, 1, 1), -1.0), "total")
     held = eb.hold(state, state.wanted, [2], np.full((10, 3, 1), -2.0), 8.0, "first")

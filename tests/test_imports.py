@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.errors import EXTRA_OF, MissingExtra, naming_extras
+from ethbrake_marl import errors
+from ethbrake_marl.errors import EXTRA_OF, MissingExtra, naming_extras, need
+from tests.refused import refused
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -178,6 +180,13 @@ def test_core__runs_where_no_extra_can_be_imported(tmp_path: Path) -> None:
     status, _, err = ended(program, cwd=tmp_path, warnings="default")
     assert status == 2 and err.splitlines()[-1].endswith(LINE), err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_extra__names_a_command_of_this_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for installed, command in (("pip", f"{sys.executable} -m pip"), ("", f"uv pip install --python {sys.executable}")):
+        monkeypatch.setattr(errors, "find_spec", {installed: object()}.get)
+        with refused(f"install it with: {command}", MissingExtra):
+            need("torch")
 
 
 def test_naming_extras__leaves_other_missing_modules_alone() -> None:

@@ -2,9 +2,13 @@
 
 import io
 import os
+import py_compile
+import shutil
 import subprocess
 import sys
+import zipfile
 from contextlib import redirect_stdout
+from importlib.util import cache_from_source
 from pathlib import Path
 
 import pytest
@@ -16,6 +20,7 @@ from ethbrake_marl.files import store
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.worlds.scenario_file import new_scenario_text
 
+ROOT = Path(__file__).resolve().parents[1]
 WITHOUT = """
 import os, signal, sys, sysconfig
 sysconfig.get_config_vars()
@@ -42,6 +47,51 @@ def test_commands__without_functions_that_only_unix_has(empty_folder: Path) -> N
     program = WITHOUT.format(os_names=OS_NAMES, signal_names=SIGNAL_NAMES, commands=commands)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.stderr.splitlines()[-1] == str([0] * len(commands)) and len(commands) >= 2
+
+
+PARTS = """
+from importlib import import_module
+import ethbrake_marl as eb
+from ethbrake_marl.registry import points
+from ethbrake_marl.worlds.catalogue import scenario_paths
+print(sorted(eb.__all__), [sorted(points(group)) for group in ("agents", "shields", "measures")], dir(eb))
+print(sorted(scenario_paths()), eb.load_scenario("standards-ccrs"), eb.load_shipped("ppo"))
+print([import_module(name).__all__ for name in {doors!r}])
+"""
+
+
+def parts(folder: Path, place: Path) -> list[str]:
+    """What a program finds in the package at ``place``."""
+    texts = {path: path.read_text("utf-8") for path in ROOT.glob("ethbrake_marl/extensions/*/__init__.py")}
+    doors = [f"ethbrake_marl.extensions.{path.parent.name}" for path, text in texts.items() if "front_door(" in text]
+    environment = {**os.environ, "PYTHONPATH": str(place), "TMPDIR": str(folder)}
+    command = [sys.executable, "-c", PARTS.format(doors=doors)]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+@pytest.mark.slow
+def test_package__without_source_files_has_all_its_parts(tmp_path: Path) -> None:
+    """Compiled only, and in a zip file."""
+    compiled, zipped = tmp_path / "compiled", tmp_path / "app.zip"
+    package = compiled / "ethbrake_marl"
+    shutil.copytree(ROOT / "ethbrake_marl", package, ignore=shutil.ignore_patterns("__pycache__", "*.npz"))
+    for name in ("scenarios", "train"):  # as in a wheel
+        shutil.copytree(ROOT / name, package / "_data" / name)
+    with zipfile.ZipFile(zipped, "w") as archive:
+        for path in package.rglob("*"):
+            archive.write(path, path.relative_to(compiled))
+    for path in package.rglob("*.py"):
+        known = Path(cache_from_source(ROOT / path.relative_to(compiled)))
+        if known.is_file():
+            shutil.copy(known, path.with_suffix(".pyc"))
+        else:
+            py_compile.compile(str(path), str(path.with_suffix(".pyc")), doraise=True)
+        path.unlink()
+    expected = parts(tmp_path, ROOT)
+    assert parts(tmp_path, compiled) == parts(tmp_path, zipped) == expected
+    assert len(expected) == 3 and not [*tmp_path.glob("ethbrake_marl-*")]
 
 
 def test_table__can_be_printed_on_every_console() -> None:

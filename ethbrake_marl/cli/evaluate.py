@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -18,7 +20,7 @@ from ethbrake_marl.cli.command import (
     SettingsOption,
 )
 from ethbrake_marl.cli.pages import page_function
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.store import check_folder
 
 if TYPE_CHECKING:
@@ -90,6 +92,8 @@ def evaluate_command(
             usual = GROUP_EPISODES if is_benchmark or (names and name not in THREE_TESTS) else 10_000
             count = usual if episodes is None else episodes
             comparisons[name] = _compare(out, name, chosen, agents, count, seed, jobs, is_benchmark=is_benchmark)
+        if output is not None:
+            output = _own_folder(out, output, names)
         if report and output is not None:
             write = page_function("evaluation", "--report")
             with out.writing():
@@ -135,7 +139,7 @@ def _show(
         with out.writing():
             place = output / name if len(tables) > 1 else output
             place.mkdir(parents=True, exist_ok=True)
-            for file in {*FILES} - {page}:
+            for file in {*FILES} - {page} if out.force else ():
                 (place / file).unlink(missing_ok=True)
             for path in write_results(place, table, results[name], per_world, force=out.force):
                 out.note(f"results: {path}")
@@ -163,5 +167,25 @@ def _check_outputs(out: Out, output: Path | None, names: list[str], per_world: s
             if value:
                 raise InvalidInput(f"{option}: needs a folder for its file; add --output FOLDER")
         return
+    _check_folders(output, names, force=out.force)
+
+
+def _check_folders(output: Path, names: list[str], *, force: bool) -> None:
     for folder in (output, *(output / name for name in names)):
-        check_folder(folder, FILES, force=out.force)
+        check_folder(folder, FILES, force=force)
+
+
+def _own_folder(out: Out, output: Path, names: list[str]) -> Path:
+    """``output``, or a new folder beside it if another process has written results there meanwhile."""
+    try:
+        _check_folders(output, names, force=out.force)
+    except AlreadyExists:
+        places = (Path(f"{output.absolute()}-{k}") for k in count(2))
+        beside = next(place for place in places if not os.path.lexists(place))
+        out.unwritten.append(
+            AlreadyExists(
+                f"{output}: another process has written results here meanwhile; these results are in {beside}"
+            )
+        )
+        return beside
+    return output

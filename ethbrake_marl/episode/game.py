@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -113,6 +113,11 @@ class Physics(Protocol):
         """State after one step, and what happened in the step; called by ``Game.follow``."""
 
 
+class Draw(Protocol):
+    def __call__(self, n: int, seed: int, first: int) -> State:
+        """Worlds ``first`` to ``first + n - 1`` of the training stream of a seed, at the alert."""
+
+
 class Game(NamedTuple):
     """A source of worlds, settings, scripts, observations, rewards; perhaps layers, other physics and a shield.
 
@@ -129,7 +134,7 @@ class Game(NamedTuple):
 
     """
 
-    draw: Callable[[int, int, int], State]  # (n, seed, first) -> worlds of the training stream at the alert
+    draw: Draw
     name: str  # of the scenario
     settings: StepSettings
     rewarding: Rewarding

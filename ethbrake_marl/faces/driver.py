@@ -14,6 +14,21 @@ from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.motion.layout import FORCE, GAP, HIT, SPEED, Floats
 from ethbrake_marl.worlds.open_game import AnyScenario
+from ethbrake_marl.worlds.quantities import QUANTITIES
+
+# least and largest value of what a simulator measures, and the unit: beyond them stand marks of missing values
+RANGES = {
+    "time_s": (0.0, 3600.0, "s"),
+    "gaps_m": (-100.0, QUANTITIES["gaps_m"].high, "m"),
+    "speeds_mps": (-QUANTITIES["speeds_mps"].high, QUANTITIES["speeds_mps"].high, "m/s"),
+    "accelerations_mps2": (-100.0, 100.0, "m/s2"),
+    "hit": (0.0, 1.0, "(truth values)"),
+}
+RANGES |= {
+    "commands_mps2": RANGES["accelerations_mps2"],
+    "obstacle_gap_m": RANGES["gaps_m"],
+    "obstacle_hit": RANGES["hit"],
+}
 
 
 class Driver:
@@ -63,7 +78,7 @@ class Driver:
         self.agent = self.game.agents(guard_scripts(team.drivers))[self.body]
         self.memory = begin_script(self.agent, self.game.marked(worlds), self.body)
         self.state = self.game.reset(worlds)
-        self.command, self.first_s = self.state.wanted[:, self.body], self.state.time_s
+        self.command, self.first_s = self.state.wanted[:, self.body], self.state.time_s.copy()
 
     def decide(
         self,
@@ -79,12 +94,12 @@ class Driver:
     ) -> Floats:
         """Command of the vehicle in every world, [n] m/s2, negative brakes; to be held until the next decision.
 
-        Raises ``InvalidInput`` for values that are not finite or of another shape, and if time goes back.
+        Raises ``InvalidInput`` for values of another shape or outside ``RANGES``, and if time goes back.
 
         Args:
             time_s: time since the alert, [n] or one number.
             gaps_m: gaps between neighbours, bumper to bumper, front to rear, [n, N - 1]; below 0 counts as 0.
-            speeds_mps: [n, N].
+            speeds_mps: [n, N]; below 0 only in a world that has had an impact.
             accelerations_mps2: what brakes and engines alone have caused until now, [n, N]. Brakes keep it at rest.
             hit: whether the pair has had an impact, [n, N - 1].
             commands_mps2: last command of each vehicle, [n, N]. Only agents need it that simulate the others, or hear
@@ -97,21 +112,24 @@ class Driver:
         line, clock, wanted = before.line.copy(), before.clock.copy(), before.wanted.copy()
         measured = [
             ("time_s", clock[:, TIME], time_s),
-            ("gaps_m", line[:, GAP, 1:-1], np.maximum(gaps_m, 0.0)),
+            ("gaps_m", line[:, GAP, 1:-1], gaps_m),
             ("speeds_mps", line[:, SPEED, 1:], speeds_mps),
             ("accelerations_mps2", line[:, FORCE, 1:], accelerations_mps2),
             ("hit", line[:, HIT, 1:-1], hit),
-            ("commands_mps2", wanted[:, 1:], wanted[:, 1:] if commands_mps2 is None else commands_mps2),
-            ("obstacle_gap_m", line[:, GAP, 0], line[:, GAP, 0] if obstacle_gap_m is None else obstacle_gap_m),
+            ("commands_mps2", wanted[:, 1:], commands_mps2),
+            ("obstacle_gap_m", line[:, GAP, 0], obstacle_gap_m),
             ("obstacle_hit", line[:, HIT, 0], obstacle_hit),
         ]
         for name, target, values in measured:
-            array = np.asarray(values, np.float64)
-            if array.shape not in ((), target.shape) or not np.isfinite(array).all():
-                raise InvalidInput(
-                    f"Driver.decide: {name} has shape {array.shape}: must be finite numbers of shape {target.shape}"
-                )
-            target[...] = array
+            if values is not None:
+                target[...] = checked_values(name, values, target.shape)
+        line[:, GAP] = np.maximum(line[:, GAP], 0.0)
+        backwards = np.argwhere((line[:, SPEED, 1:] < 0.0) & ~line[:, HIT].any(axis=1, keepdims=True))
+        if len(backwards):
+            raise InvalidInput(
+                f"Driver.decide: speeds_mps{backwards[0].tolist()} is below 0: must be at least 0 m/s in a world"
+                " without an impact"
+            )
         if (clock[:, TIME] < before.time_s).any():
             raise InvalidInput(
                 f"Driver.decide: time_s = {clock[:, TIME].min():g}: must be {before.time_s.max():g} or later, the time"
@@ -126,3 +144,22 @@ class Driver:
         self.command, self.memory = ask_script(self.agent, state, self.memory, self.body)
         self.state = state
         return self.command.copy()
+
+
+def checked_values(name: str, values: Any, shape: tuple[int, ...]) -> Floats:
+    """Measured values as an array of ``shape`` or one number. Raises ``InvalidInput``."""
+    try:
+        array = np.asarray(values)
+    except ValueError:  # lists of different lengths
+        array = np.empty(0, object)
+    if array.dtype.kind not in "bfiu" or np.ma.is_masked(values):
+        raise InvalidInput(f"Driver.decide: {name} = {values!r:.60}: must be numbers, none of them missing")
+    if array.shape not in ((), shape):
+        raise InvalidInput(f"Driver.decide: {name} has shape {array.shape}: must have shape {shape}")
+    low, high, unit = RANGES[name]
+    bad = np.argwhere(~((array >= low) & (array <= high)))
+    if len(bad):
+        place, value = bad[0].tolist() or "", array[tuple(bad[0])]
+        right = f"must be finite and in [{low:g}, {high:g}] {unit}"
+        raise InvalidInput(f"Driver.decide: {name}{place} = {value:g}: {right}")
+    return array.astype(np.float64)

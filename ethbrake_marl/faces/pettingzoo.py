@@ -105,16 +105,17 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
             self._need_learner()
         names, learning = self.scenario.vehicle_names, self.game.settings.learners
         self.actions, self.bodies = actions, np.arange(1, len(names) + 1) if agents == "all" else learning
-        self.possible_agents = [names[i - 1] for i in self.bodies]
         self._rows = {names[i - 1]: i - 1 for i in self.bodies}  # of an agent's vehicle in the arrays of a step
         self._learners = [names[i - 1] for i in learning]
         views = [self.game.views[i] for i in self.bodies]
         self._alike = len(set(views)) == 1
-        self.observation_spaces = dict(zip(self.possible_agents, (feature_box(v.features) for v in views), strict=True))
-        self.action_spaces = {a: action_space(actions if a in self._learners else None) for a in self.possible_agents}
+        self._observation_spaces = dict(zip(self._rows, (feature_box(view.features) for view in views), strict=True))
+        self._action_spaces = {
+            agent: action_space(actions if agent in self._learners else None) for agent in self._rows
+        }
         self.state_space = feature_box(state_features(len(names), *self._of_state))
-        if components := self.game.rewarding.components:  # as MOMAland has it
-            self.reward_spaces = {agent: reward_box(components) for agent in self.possible_agents}
+        components = self.game.rewarding.components
+        self._reward_spaces = {agent: reward_box(components) for agent in self._rows if components}
 
     @cached_property
     def np_random(self) -> np.random.Generator:
@@ -122,22 +123,41 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         seed = self.stream.seed
         return np.random.default_rng(None if seed is None else [seed, self.stream.next])
 
+    # New lists and dictionaries: a caller may sort or change them
+
+    @property
+    def possible_agents(self) -> list[str]:
+        return [*self._rows]
+
     @property
     def agents(self) -> list[str]:
         running = self.episode is not None and self.episode.clock[0, ENDED] == 0.0
-        return self.possible_agents[:] if running else []
+        return self.possible_agents if running else []
+
+    @property
+    def observation_spaces(self) -> dict[str, Any]:
+        return {**self._observation_spaces}
+
+    @property
+    def action_spaces(self) -> dict[str, Any]:
+        return {**self._action_spaces}
+
+    @property
+    def reward_spaces(self) -> dict[str, Any]:
+        """Empty if rewards are numbers."""
+        return {**self._reward_spaces}
 
     def observation_space(self, agent: str) -> Any:
-        return self.observation_spaces[agent]
+        return self._observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
-        return self.action_spaces[agent]
+        return self._action_spaces[agent]
 
     def reward_space(self, agent: str) -> Any:
-        """Raises ``InvalidInput`` if rewards are numbers."""
-        if not self.game.rewarding.components:
+        """As MOMAland has it. Raises ``InvalidInput`` if rewards are numbers."""
+        if not self._reward_spaces:
             raise InvalidInput("reward_space: rewards are numbers here; make the environment with reward_vector")
-        return self.reward_spaces[agent]
+        return self._reward_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -162,8 +182,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         answer = (
             self._observations(state),
             {agent: rewards[row] for agent, row in self._rows.items()},
-            dict.fromkeys(self.possible_agents, bool(step.out[TERMINATED, 0])),
-            dict.fromkeys(self.possible_agents, bool(step.out[TRUNCATED, 0])),
+            dict.fromkeys(self._rows, bool(step.out[TERMINATED, 0])),
+            dict.fromkeys(self._rows, bool(step.out[TRUNCATED, 0])),
             self._by_agent(self._infos(self.stream, state, step)),
         )
         self._keep(self.stream, state, self.renderer.stepped)
@@ -181,14 +201,14 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
                 f"step: actions = {actions!r}: must be a mapping from agent to action, such as {{'vehicle_2': [-1.0]}}"
             )
         for agent in actions:
-            if agent in self.action_spaces:
+            if agent in self._rows:
                 continue
             if agent in self.scenario.vehicle_names:
                 raise InvalidInput(
                     f"step: {agent} follows the script {self.scenario.roles[agent]}, so it takes no action here; leave"
                     f" its action out, or make the environment with learners={[*self._learners, agent]}"
                 )
-            raise unknown_name("agent", agent, self.possible_agents)
+            raise unknown_name("agent", agent, self._rows)
         columns = []
         for agent in self._learners:
             action = actions.get(agent)
@@ -203,7 +223,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return self._by_agent([observation[0] for observation in self.game.observe(state, self.bodies)])
 
     def _by_agent(self, values: Any) -> dict[str, Any]:
-        return {agent: values[k] for k, agent in enumerate(self.possible_agents)}
+        return dict(zip(self._rows, values, strict=True))
 
 
 parallel_env = EthBrakeParallelEnv

@@ -53,7 +53,8 @@ def make_sb3_vec_env(
 
     - ``seed``: seed of the training worlds; None: a random one.
     - ``horizon_is_end``: report an episode that reaches the horizon as terminated, not as truncated. Harm after the
-      horizon is not counted, so values bootstrapped beyond it could grow without limit.
+      horizon is not counted, so values bootstrapped beyond it could grow without limit. An end by ``max_cycles`` before
+      the horizon is always truncated.
     - ``appended``: numbers after each observation: the learner's ``number`` in its world, from 0, or the full
       ``state``.
     - ``step_infos``: return infos at every step, not only at the last one.
@@ -131,7 +132,7 @@ class EthBrakeVecEnv(Face, VecEnv):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         self._seeds = [chosen_seed(seed)] * self.num_envs
-        return self._seeds
+        return self._seeds[:]
 
     def reset(self) -> Observations:
         options = self._options
@@ -184,10 +185,9 @@ class EthBrakeVecEnv(Face, VecEnv):
         """``step``: last step of all worlds, which led to ``state``."""
         terms = {name: term[ended] for name, term in step.terms.items()}
         step = step._replace(reward=step.reward[ended], out=step.out[:, ended], terms=terms)
-        cut = (step.truncated & (not self.horizon_is_end)).repeat(len(self.bodies)).tolist()
         infos = self._infos(self.stream, state.take(ended), step)
-        for info, truncated in zip(infos, cut, strict=True):
-            info["TimeLimit.truncated"] = truncated
+        for info, truncated in zip(infos, step.truncated.repeat(len(self.bodies)).tolist(), strict=True):
+            info["TimeLimit.truncated"] = truncated and (info["cut"] or not self.horizon_is_end)
         return infos
 
     @property

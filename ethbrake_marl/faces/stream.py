@@ -48,7 +48,7 @@ class Stream(NamedTuple):
         ``InvalidInput`` for a bad seed or option; warns of unknown options.
         """
         chosen, first = self.seed, self.next
-        if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
+        if isinstance(seed, list | tuple | range) or (isinstance(seed, np.ndarray) and seed.ndim):
             if len(seed) != n:
                 raise InvalidInput(f"reset: seed has {len(seed)} entries; must be one seed, or a list of {n} seeds")
             chosen, first = [chosen_seed(row_seed) for row_seed in seed], np.zeros(n, np.int64)
@@ -138,5 +138,5 @@ def chosen_seed(seed: int | None) -> int:
     if seed is None:
         return int.from_bytes(np.random.SeedSequence().generate_state(2).tobytes(), "little") % 2**63
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:
-        raise InvalidInput(f"reset: seed = {seed!r}: must be None or a whole number, at least 0")
+        raise InvalidInput(f"reset: seed = {seed!r:.60}: must be None or a whole number, at least 0")
     return int(seed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
+from math import isnan
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, NoReturn, TypeVar, get_args
 
@@ -195,7 +196,7 @@ def _unquote(detail: ErrorDetails) -> str:
 
 def _right(detail: ErrorDetails) -> str:
     kind = detail["type"]
-    if detail["input"] != detail["input"]:  # NaN
+    if isinstance(detail["input"], float) and isnan(detail["input"]):
         return "must be a finite number"
     if kind == "float_type":
         return "must be a number"
@@ -222,7 +223,7 @@ def suggestion(key: str, known: Iterable[str]) -> str:
     """
     names = sorted(known)
     stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}
-    same = stems.get(key.rsplit("_", 1)[0]) or stems.get(key)
+    same = next((name for stem, name in stems.items() if f"{key}_".startswith(f"{stem}_")), None)
     close = [same] if same else get_close_matches(key, names, n=1)
     if not close:
         return ""

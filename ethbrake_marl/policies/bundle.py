@@ -9,15 +9,14 @@ from pathlib import Path
 
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, unknown_name
 from ethbrake_marl.files.model import read_json_model
+from ethbrake_marl.files.package import package_folder
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.policies.manifest import Manifest, content_sha256
 from ethbrake_marl.policies.policy import MANIFEST, WEIGHTS, Policy, checked_tensors
 
 LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}  # largest sizes of the files of a bundle
-POLICY_FOLDER = (
-    Path(__file__).resolve().parents[1] / "shipped" / "policies"
-)  # NAME/policy is a bundle, NAME/card.md describes it
+POLICY_FOLDER = package_folder() / "shipped" / "policies"  # NAME/policy is a bundle, NAME/card.md describes it
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:

@@ -194,7 +194,7 @@ class PpoRecipe(TrainingRecipe):
 
     schemes = get_args(Scheme)
 
-    algorithm: Literal["ppo"]
+    algorithm: Annotated[str, Field(pattern="^ppo$")]
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
     n_steps: int = Field(ge=2, description="number of decisions of each learner in each world between two updates")
     n_epochs: int = Field(ge=1, le=1000, description="number of passes over the collected decisions in one update")
@@ -224,7 +224,7 @@ class PpoRecipe(TrainingRecipe):
 class SacRecipe(TrainingRecipe):
     """Recipe of SAC: an update stores ``steps_per_update`` decisions of every learner, and learns from stored ones."""
 
-    algorithm: Literal["sac"]
+    algorithm: Annotated[str, Field(pattern="^sac$")]
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
     steps_per_update: int = Field(
         1, ge=1, le=10_000, description="number of decisions of each learner in each world between two updates"

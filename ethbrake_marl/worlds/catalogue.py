@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ethbrake_marl.errors import AlreadyExists, IgnoredName, InvalidInput, unknown_name
+from ethbrake_marl.files.package import package_folder
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS, changed_content
 from ethbrake_marl.worlds.scenario import Scenario, plain
 from ethbrake_marl.worlds.table import read_rows
 
-_PACKAGE = Path(__file__).resolve().parents[1]
+_PACKAGE = package_folder()
 
 FOLDERS: dict[str, Path] = {}  # registered folders: path as text -> path
 

@@ -73,7 +73,9 @@ class WorldPool:
         return WorldPool, (self.scenario, self.purpose)  # without the worlds
 
     def __call__(self, n: int, seed: int, first: int) -> State:
-        """The arrays are new."""
+        """The arrays are new. Raises ``InvalidInput`` for bad arguments."""
+        world_numbers(n, seed, first, self.purpose)
+        n, seed, first = int(n), int(seed), int(first)
         follows, self.following = (seed, first) == self.following, (seed, first + n)
         worlds = self._stored_worlds(n, seed, first)
         if worlds is None and follows and n < self.most:

@@ -238,7 +238,7 @@ class Scenario(ScenarioPart):
         no world.
         """
         world_numbers(n, seed, first, purpose)
-        return self._pools[purpose](int(n), int(seed), int(first))
+        return self._pools[purpose](n, seed, first)
 
     def draw(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> DrawnWorlds:
         """The worlds of ``sample``, with values that their state does not contain."""

@@ -1,12 +1,15 @@
 """``ethbrake evaluate``: what its options change, what it leaves, and what it needs."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.evaluation import comparison
 from tests.fixtures.commands import Command, check_refused, rows_of, told_json
 
 
@@ -86,3 +89,35 @@ def test_output__deletes_the_files_of_earlier_results_and_nothing_else(ethbrake:
     (tmp_path / "out" / "notes.txt").write_text("mine")
     assert ethbrake(*line).status == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"results.json", "notes.txt"}
+
+
+@pytest.mark.parametrize(
+    ("options", "files"),
+    [
+        ("--per-world csv", {"results.json", "worlds.csv"}),
+        ("--scenario stress", {"stress-wide", "stress-wide-obstacle"}),
+        ("--scenario benchmark-pair", {"results.json", "rows.csv"}),
+    ],
+)
+def test_output__of_a_process_that_comes_late_is_beside_that_of_the_first(
+    options: str, files: set[str], ethbrake: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = f"evaluate --agents coast --episodes 2 {options} --output"
+    for folder in ("first", "taken-2"):
+        assert ethbrake(*line.split(), tmp_path / folder).status == 0
+    content = {path: path.read_bytes() for path in (tmp_path / "first").rglob("*.*") if path.is_file()}
+    of_one = comparison.evaluate
+
+    def evaluate_meanwhile(*arguments: Any, **settings: Any) -> Any:
+        shutil.copytree(tmp_path / "first", tmp_path / "taken", dirs_exist_ok=True)  # what another process writes
+        return of_one(*arguments, **settings)
+
+    monkeypatch.setattr(comparison, "evaluate", evaluate_meanwhile)
+    late = ethbrake(*line.split(), tmp_path / "taken")
+    assert late.status == 3 and "another process has written results here meanwhile; these" in late.err
+    assert late.err.splitlines()[-1].endswith(f"results are in {tmp_path / 'taken-3'}")
+    assert {path.name for path in (tmp_path / "taken-3").iterdir()} == files
+    for path, data in content.items():
+        assert (tmp_path / "taken" / path.relative_to(tmp_path / "first")).read_bytes() == data
+    forced = ethbrake(*line.split(), tmp_path / "taken", "--force")
+    assert forced.status == 0 and not (tmp_path / "taken-4").exists()

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.shaping import potential
 from ethbrake_marl.errors import InvalidInput
@@ -99,6 +100,76 @@ def test_arrays__what_was_returned_never_changes_and_what_was_given_is_left_alon
         for array in turn.arrays():
             array.fill(True if array.dtype == np.bool_ else np.nan)
     assert all(np.array_equal(array, copy_) for array, copy_ in kept)
+
+
+TWELVE = FIVE.replace(
+    vehicles=12, braking_capacity_mps2=6, latency_s=0.4, roles={f"vehicle_{i}": "learner" for i in range(2, 13)}
+)
+
+
+def spoil(value: Any) -> None:
+    """Change all that can be changed in what a caller got."""
+    for part in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
+        spoil(part)
+    if isinstance(value, list):
+        value.reverse()
+        value[1:] = []
+    elif isinstance(value, dict):
+        value.clear()
+    elif isinstance(value, np.ndarray):
+        value.fill(True if value.dtype.kind in "bO" else 77)
+
+
+# Reset and step of an environment as its library calls them, and what else can be read of it.
+LIBRARIES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], list[str]]] = {
+    "PettingZoo": (
+        lambda: eb.parallel_env(TWELVE, reward_vector="vehicles"),
+        lambda env: env.step({f"vehicle_{i}": [-0.1 * (i % 9)] for i in range(2, 13)}),
+        ["possible_agents", "agents", "observation_spaces", "action_spaces", "reward_spaces", "metadata"],
+    ),
+    "PettingZoo, learners alone": (
+        lambda: eb.parallel_env(TWELVE, agents="learners"),
+        lambda env: env.step({f"vehicle_{i}": [-0.1 * (i % 9)] for i in range(2, 13)}),
+        ["possible_agents", "agents", "observation_spaces", "action_spaces"],
+    ),
+    "Gymnasium": (
+        lambda: eb.EthBrakeEnv(PAPER, reward_vector="vehicles"), lambda env: env.step([-0.3]), ["metadata"]
+    ),
+    "vector": (lambda: eb.EthBrakeVectorEnv(4, PAPER, max_episode_steps=9), lambda env: env.step([[-0.3]] * 4), []),
+    "SB3": (
+        lambda: eb.make_sb3_vec_env(PAPER, 4, step_infos=True, max_cycles=9),
+        lambda env: env.step([[-0.3]] * 4),
+        ["reset_infos"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LIBRARIES)
+def test_what_is_returned__can_be_changed_without_harm(name: str) -> None:
+    make_env, step, names = LIBRARIES[name]
+    told: list[list[str]] = []
+    for is_spoilt in (False, True):
+        env, seen = make_env(), []
+
+        def read(value: Any, seen: list[str] = seen, is_spoilt: bool = is_spoilt) -> None:
+            seen.append(repr(value))
+            if is_spoilt:
+                spoil(value)
+
+        if name == "SB3":
+            read(env.seed(7))
+            read(env.reset())
+        else:
+            read(env.reset(seed=7))
+        for _ in range(12):
+            read(step(env))
+            for attribute in names:
+                read(getattr(env, attribute))
+            read(env.describe_worlds())
+            if hasattr(env, "state"):
+                read(env.state())
+        told.append(seen)
+    assert told[0] == told[1] and len(set(told[0])) > 12
 
 
 @pytest.mark.parametrize(
@@ -213,7 +284,10 @@ REFUSED: list[tuple[Callable[[Interface], Any], str]] = [
     *((acts(value), r"(nan|1\.001): must be from -1 \(full braking\) to 1") for value in (np.nan, 1.001)),
     (acts("full"), r"must be a number in \[-1, 1\]"),
     (acts(0.5, (2,)), "must have shape"),
-    *((lambda given, seed=seed: given.reset(seed), "seed = .*must be None or a") for seed in (-1, True)),
+    *(
+        (lambda given, seed=seed: given.reset(seed), "seed = .*must be None or a")
+        for seed in (-1, True, 3.0, "7", b"ab", np.array(3), np.array("3"), {3, 4})
+    ),
     *((starts(state), "initial_state") for state in ({"gaps_m": [7, -1]}, 0)),
     (starts({"gaps_m": 3, "speeds_mps": 20, "braking_capacity_mps2": 4}), "constant:5"),  # of the script of Vehicle 3
 ]

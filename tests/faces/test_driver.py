@@ -92,10 +92,8 @@ def test_driver__drives_one_of_several_learners() -> None:
 def test_driver__refusals() -> None:
     driver = driver_of()
     gaps, speeds, accelerations, hit = MEASURED
-    with refused("Driver.decide: gaps_m has shape (2,): must be finite numbers of shape (1, 2)"):
+    with refused("Driver.decide: gaps_m has shape (2,): must have shape (1, 2)"):
         driver.decide(0.5, gaps[0], speeds, accelerations, hit)
-    with refused("Driver.decide: speeds_mps has shape (1, 3): must be finite"):
-        driver.decide(0.5, gaps, [[17.0, np.nan, 21.0]], accelerations, hit)
     driver.decide(0.7, *MEASURED)
     with refused("Driver.decide: time_s = 0.6: must be 0.7 or later"):
         driver.decide(0.6, *MEASURED)
@@ -105,3 +103,46 @@ def test_driver__refusals() -> None:
         driver_of("ladder")
     with refused("unknown learner 'vehicle_3'; did you mean 'vehicle_2'?"):
         driver_of(vehicle="vehicle_3")
+
+
+INVALID = -1073741824.0  # of SUMO
+VALUES: dict[str, Any] = dict(
+    zip(("time_s", "gaps_m", "speeds_mps", "accelerations_mps2", "hit"), (0.5, *MEASURED), strict=True)
+)
+VALUES |= {"hit": [[False, False]], "commands_mps2": [[-6.0, 0.0, 0.0]], "obstacle_gap_m": [30.0], "obstacle_hit": [0]}
+
+
+@pytest.mark.parametrize("name", VALUES)
+@pytest.mark.parametrize("value", [INVALID, np.nan, np.inf, -np.inf, 1e6, -999.0])
+def test_driver__refuses_marks_of_missing_values_and_leaves_its_state(name: str, value: float) -> None:
+    driver, bad = driver_of(Remembers(), eb.load_scenario("paper-random-obstacle")), np.array(VALUES[name], float)
+    bad[(..., -1) if bad.ndim else ()] = value
+    where = str([0] * (bad.ndim - 1) + [bad.shape[-1] - 1]) if bad.ndim else ""
+    with refused(f"Driver.decide: {name}{where} = {value:g}: must be finite and in ["):
+        driver.decide(**VALUES | {name: bad})
+    assert [driver.decide(**VALUES | {"time_s": time_s}).tolist() for time_s in (0.5, 0.6)] == [[0.0], [-0.1]]
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_driver__refuses_what_is_no_number(name: str) -> None:
+    shape = np.shape(VALUES[name])
+    masked = np.ma.masked_array(np.array(VALUES[name], float), np.ones(shape, bool))
+    for value in (np.full(shape, "17"), np.full(shape, None), masked, [[1.0], [1.0, 2.0]]):
+        with refused(f"Driver.decide: {name} = "):
+            driver_of().decide(**VALUES | {name: value})
+
+
+def test_driver__speeds_below_0_only_after_an_impact() -> None:
+    back = VALUES | {"speeds_mps": [[17.0, -0.5, 21.0]]}
+    with refused("Driver.decide: speeds_mps[0, 1] is below 0: must be at least 0 m/s in a world without an impact"):
+        driver_of().decide(**back)
+    for impact in ({"hit": [[False, True]]}, {"obstacle_hit": True}):
+        driver = driver_of()
+        driver.decide(**back | impact)
+        assert driver.state.speeds_mps[0, 1] == -0.5
+
+
+def test_driver__first_s_is_the_caller_s_own() -> None:
+    driver = driver_of()
+    driver.first_s += 9.0
+    assert driver.decide(0.5, *MEASURED).tolist() == [-7.0]

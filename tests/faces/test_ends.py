@@ -153,3 +153,24 @@ def test_cut__is_false_where_all_vehicles_have_come_to_rest() -> None:
     env.reset()
     *_, last_step = [env.step([-1.0]) for _ in range(10)]
     assert last_step[2:4] == (True, False) and last_step[4]["cut"] is False
+
+
+@pytest.mark.parametrize("horizon_is_end", [True, False])
+def test_cut__is_a_truncation_by_every_door(horizon_is_end: bool) -> None:
+    for scenario, most, flags in (
+        (CRASH, 4, (False, True)),
+        (CRASH, 8, (False, True)),  # the horizon itself
+        (REST, 10, (True, False)),  # at rest in the step of the cut
+    ):
+        env = eb.make_sb3_vec_env(scenario, 2, horizon_is_end=horizon_is_end, max_cycles=most)
+        env.reset()
+        for _ in range(most):
+            *_, done, infos = env.step([[-1.0]] * 2)
+        is_horizon = scenario is CRASH and most == 8
+        expected = flags[1] and not (is_horizon and horizon_is_end)
+        assert done.all() and [info["TimeLimit.truncated"] for info in infos] == [expected] * 2
+        for name, make in BARE.items():
+            interface = make(scenario, 1, **{NAMES.get(name, "max_cycles"): most})
+            interface.reset(7)
+            turns = [interface.step(np.full((1, 1), -1.0, np.float32)) for _ in range(most)]
+            assert (turns[-1].terminated[0], turns[-1].truncated[0]) == flags, (name, most)

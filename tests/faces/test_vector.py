@@ -174,6 +174,10 @@ def test_seeds__none_in_a_list_is_drawn_and_bad_lists_are_refused() -> None:
         ([1, 2, 3], "2 seeds"),
         ([1, -2], "at least 0"),
         ([1, "2"], "whole"),
+        ([np.array(1), 2], "whole"),
+        (np.zeros((2, 1), int), "whole"),
+        (np.array(3), "whole"),
+        (b"ab", "whole"),
     ):
         with refused(right):
             env.reset(seed=seeds)

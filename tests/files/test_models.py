@@ -16,6 +16,13 @@ class Inner(FileModel):
     kind: Literal["a", "b"] = "a"
 
 
+class Ambiguous:
+    """As a tensor: it cannot tell whether it equals itself."""
+
+    def __ne__(self, other: object) -> bool:
+        raise RuntimeError
+
+
 class Content(FileModel):
     name: str
     inner: Inner | None = None
@@ -50,6 +57,12 @@ def test_json_of_a_program__is_read_or_its_first_mistake_is_told() -> None:
     with pytest.raises(ValidationError) as caught:
         Inner.model_validate({"gap_m": float("nan"), "kind": 3})
     assert str(first_mistake(caught.value)) == "kind: must be a or b"
+
+
+def test_mistake__of_an_array_is_told() -> None:
+    with pytest.raises(ValidationError) as caught:
+        Inner.model_validate({"gap_m": Ambiguous()})
+    assert str(first_mistake(caught.value)) == "gap_m: must be a number"
 
 
 def test_schema__offers_no_null() -> None:

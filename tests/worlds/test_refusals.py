@@ -51,6 +51,16 @@ REFUSED: dict[str, Callable[[], object]] = {
         gaps_m=None, road_friction="0.7"
     ),
     "line 15: gaps_km: unknown key; did you mean gaps_m (metres)?": lambda: given(gaps_m=None, gaps_km="0.007"),
+    "line 15: mass_kilograms: unknown key; did you mean mass_t (tonnes)?": lambda: given(
+        mass_t=None, mass_kilograms="5500"
+    ),
+    "line 15: speeds_kilometres_per_hour: unknown key; did you mean speeds_mps (metres per second)?": lambda: given(
+        speeds_mps=None, speeds_kilometres_per_hour="72"
+    ),
+    "line 15: latency: unknown key; did you mean latency_s (seconds)?": lambda: given(latency_s=None, latency="0.5"),
+    "line 15: v2x.radio_milliseconds: unknown key; did you mean radio_s (seconds)?": lambda: given(
+        v2x="{preset: nominal, radio_milliseconds: 20}"
+    ),
     "line 15: restituton: unknown key; did you mean restitution?": lambda: given(restitution=None, restituton="0.1"),
     "bad.yaml: gaps_m: missing; write, for instance, gaps_m: 7, or time_gaps_s: 1": lambda: given(gaps_m=None),
     "line 5: gaps_m = -1: must be finite and in [0, 10000] m (metres)": lambda: given(gaps_m="-1"),
@@ -66,6 +76,19 @@ REFUSED: dict[str, Callable[[], object]] = {
         gaps_m="{uniform: [5]}"
     ),
     "line 5: gaps_m.uniform = [9, 6]: low must not be above high": lambda: given(gaps_m="{uniform: [9, 6]}"),
+    "line 5: gaps_m.loguniform = [9, 6]: low must not be above high": lambda: given(gaps_m="{loguniform: [9, 6]}"),
+    "line 5: gaps_m[1].loguniform (vehicle_2 to vehicle_3) = [9, 6]: low must not be above high": lambda: given(
+        gaps_m="[7, {loguniform: [9, 6]}]"
+    ),
+    "line 5: gaps_m.normal = {mean: 7, sd: 1, low: 9, high: 5}: low must be below high": lambda: given(
+        gaps_m="{normal: {mean: 7, sd: 1, low: 9, high: 5}}"
+    ),
+    "line 5: gaps_m.lognormal = {median: 7, sigma: 1, low: 9, high: 5}: low must be below high": lambda: given(
+        gaps_m="{lognormal: {median: 7, sigma: 1, low: 9, high: 5}}"
+    ),
+    "vehicle_types.car.mass_t.loguniform = [2, 1]: low must not be above high": lambda: given(
+        vehicle_types="{car: {mass_t: {loguniform: [2, 1]}}}"
+    ),
     "line 5: gaps_m.choice: cannot be combined with the other keys here; a quantity has only one": lambda: given(
         gaps_m="{uniform: [5, 9], choice: [7]}"
     ),

@@ -3,8 +3,10 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.worlds import sampling
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.scenario import Scenario
@@ -41,6 +43,9 @@ def read(text: str, scenario: Scenario = PAPER) -> object:
 REFUSED: dict[str, Callable[[], object]] = {
     "worlds.csv, line 1: unknown column 'gap_1_km'; did you mean gap_1_m (metres)?": lambda: read(
         "gap_1_km,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n1,2,3,4,5\n"
+    ),
+    "worlds.csv, line 1: unknown column 'mass_2_kilograms'; did you mean mass_2_t (tonnes)?": lambda: read(
+        HEADER + ",mass_2_kilograms\n1,2,3,4,5,5500\n"
     ),
     "worlds.csv, line 1: columns are separated by semicolons; separate them by commas": lambda: read(
         HEADER.replace(",", ";") + "\n7,5;8;20;18;20\n"
@@ -104,6 +109,9 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "number of worlds = 0: must be a whole number in 1..10000000": lambda: PAPER.sample(n=0, seed=1),
     "seed of the list = None: must be a whole number, at least 0": lambda: PAPER.sample(n=1, seed=None),
+    "seed of the list = -1: must be a whole number, at least 0": lambda: open_game(PAPER)[1].draw(2, -1, 0),
+    "first world = '3': must be a whole number in 0..": lambda: open_game(PAPER)[1].draw(2, 7, "3"),  # type: ignore[arg-type]
+    "seed of the list = array([3, 4]): must be": lambda: open_game(PAPER)[1].draw(2, np.array([3, 4]), 0),  # type: ignore[arg-type]
     "first world = 4503599627370497: must be a whole number": lambda: PAPER.sample(n=1, seed=1, first=2**52 + 1),
     "sample: purpose = 'test': must be one of list, training": lambda: PAPER.sample(n=1, seed=1, purpose="test"),
     "scenario 'paper-random': early_impacts: reject, but in all 1000 draws of": lambda: CLOSE.sample(1, 0),

@@ -11,4 +11,4 @@ if TYPE_CHECKING:
     )
 
 else:
-    __getattr__ = front_door(__name__, __file__)
+    __getattr__ = front_door(__name__)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
@@ -54,7 +54,7 @@ class VineRecipe(TrainingRecipe):
         lt=1.0,
         description="share of the weight average that a gradient step keeps; the trained policy uses the average",
     )
-    algorithm: Literal["vine"]
+    algorithm: Annotated[str, Field(pattern="^vine$")]
     start: Text | None = Field(
         None, description="trained policy to start from, as in --agents: ppo, or policy@PATH; left out: random weights"
     )

@@ -70,6 +70,7 @@ def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
     entry, unread = recording.entry, recording.unread
     if entry.by_lane:
         on_road = pd.concat([states, unread], ignore_index=True)
+        states["odd"] = on_road.groupby(["moment", "lane"])["odd"].transform("any")  # who is ahead of whom?
         ordered = on_road.sort_values(["moment", "lane", "front"], ascending=[True, True, False], kind="stable")
         states["ahead"] = ordered.groupby(["moment", "lane"])["vehicle"].shift(1).fillna(-1.0)
     is_unread = pd.MultiIndex.from_frame(states[["moment", "ahead"]]).isin(
@@ -77,7 +78,7 @@ def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
     )
     left_out["links to a vehicle that has no row near this time"] += int(is_unread.sum())
     states.loc[is_unread, "ahead"] = -1.0
-    ahead_states = states[["moment", "vehicle", "lane", "front", "side", "dx", "dy", "length", "speed"]]
+    ahead_states = states[["moment", "vehicle", "lane", "front", "side", "dx", "dy", "length", "speed", "odd"]]
     ahead_states = ahead_states.add_suffix("_ahead").assign(front_car=states.index)
     pairs = states.merge(ahead_states, "left", left_on=["moment", "ahead"], right_on=["moment_ahead", "vehicle_ahead"])
     along = pairs["front_ahead"] - pairs["length_ahead"] * pairs["dx_ahead"] - pairs["front"]
@@ -86,40 +87,46 @@ def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
     slowest = np.minimum(pairs["speed_ahead"], pairs["speed"])
     noise = (gap <= 0.0) & (slowest < entry.standing_mps)
     same_lane = pairs["lane_ahead"] == pairs["lane"]
-    missing, overlap = (pairs["ahead"] >= 0.0) & gap.isna(), (gap <= 0.0) & same_lane & ~noise
+    odd = pairs["odd"] | (pairs["odd_ahead"] == True)  # noqa: E712  # NaN without a vehicle ahead
+    missing, overlap = (pairs["ahead"] >= 0.0) & gap.isna(), (gap <= 0.0) & same_lane & ~noise & ~odd
     _check_faults(recording, pairs[missing | overlap], left_out)
     is_valid = gap.notna() & ~overlap
-    for what, odd in (
+    for what, unfit in (
+        ("links in a lane where the place of a vehicle contradicts its other places", odd),
         ("links of standing cars whose gap was recorded as 0 or less", noise),
         ("links to another lane, or of a vehicle that rolls backwards", ~same_lane | (slowest < 0.0)),
         (f"links of more than {FARTHEST_M:,.0f} m", gap > FARTHEST_M),
     ):
-        left_out[what] += int((is_valid & odd).sum())
-        is_valid &= ~odd
+        left_out[what] += int((is_valid & unfit).sum())
+        is_valid &= ~unfit
     links = pairs[is_valid].sort_values("gap", kind="stable")
     return links.drop_duplicates("front_car").astype({"front_car": int})
 
 
 def _check_faults(recording: Recording, faulty: Any, left_out: Counter[str]) -> None:
-    """Count vehicles that overlap the one ahead, or whose vehicle ahead is not recorded.
+    """Count odd places, and vehicles that overlap the one ahead or follow one that is not recorded.
 
     Raises ``InvalidInput`` if their share exceeds the format's limit.
     """
     states = recording.states
     twice = states[states.duplicated(["moment", "vehicle"])]
-    number = len(faulty) + len(twice)
+    odd = states[states["odd"]]
+    number = len(faulty) + len(twice) + len(odd)
     if number > recording.entry.impossible * len(states):
-        all_faults = pd.concat([faulty, twice.assign(gap=math.inf)])
+        all_faults = pd.concat([faulty, twice.assign(gap=math.inf), odd.assign(gap=-math.inf)])
         first = all_faults.sort_values(["moment", "vehicle"], kind="stable").iloc[0]
         ahead = f"vehicle {recording.name(first['ahead'])}"
         fault = f"follows {ahead}, which is not recorded at this time"
         if first["gap"] == math.inf:
             fault = "is recorded twice for this time"
+        elif first["gap"] == -math.inf:
+            fault = "is at a place that contradicts its other places and its speed"
         elif first["gap"] <= 0.0:
             fault = f"overlaps {ahead} ahead by {-first['gap']:.2f} m"
         raise InvalidInput(
             f"{recording.cells.place(int(first['row']))}: vehicle {recording.name(first['vehicle'])} {fault};"
-            f" {number:,} of {len(states):,} positions of vehicles are faulty (recorded twice, overlapping, or behind a"
-            f" vehicle that is not recorded), but at most {recording.entry.impossible:.0%} may be faulty"
+            f" {number:,} of {len(states):,} positions of vehicles are faulty (recorded twice, contradicting the"
+            f" vehicle's other positions, overlapping, or behind a vehicle that is not recorded), but at most"
+            f" {recording.entry.impossible:.0%} may be faulty"
         )
-    left_out["vehicles that overlap, are recorded twice, or follow one that is not recorded"] += number
+    left_out["vehicles that overlap, jump, are recorded twice, or follow one that is not recorded"] += number

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +14,7 @@ from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.extensions.recorded.formats import HIGHD_META, Format
 from ethbrake_marl.extensions.recorded.interpolation import Between, interpolated, rows_between
 from ethbrake_marl.extensions.recorded.reading import Cells, read_cells
-from ethbrake_marl.motion.layout import Floats, Ints
+from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.quantities import QUANTITIES
 
 FASTEST_MPS, LONGEST_M = 75.0, 40.0  # largest speed (270 km/h) and length of a road vehicle
@@ -26,6 +28,10 @@ CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3
 # metres. It is checked if the squared distances driven in a lane sum up to LEAST_M2: one drive of 10 m.
 SLOPE, LEAST_M2 = (0.5, 2.0), 100.0
 
+NOISE_M, HARDEST_MPS2 = 3.0, 10.0  # error of a place, and largest acceleration between two moments
+NUMERAL = r"[+-]?\d+\.?\d*"
+NO_NAME = ("", "nan", "none", "null")  # cells without a name, in lower case
+
 
 class Recording(NamedTuple):
     """States of the vehicles of one file at regular moments.
@@ -34,7 +40,7 @@ class Recording(NamedTuple):
     number). Further columns: ``lane``; ``ahead``, number of the vehicle ahead, negative if there is none; ``front`` and
     ``side``, x and y of the vehicle's front (m); ``dx`` and ``dy``, unit vector of its direction of travel (1 and 0 if
     positions are along the road); ``length`` (m), 0 if the data contain gaps; ``speed`` (m/s); ``row``, number of the
-    row in the file.
+    row in the file; ``odd``, whether the vehicle's other places contradict this one.
     """
 
     cells: Cells
@@ -59,6 +65,8 @@ def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
     if raw.empty:
         right = f" except those from {' and '.join(entry.streets)}, which have crossings" * bool(entry.streets)
         raise InvalidInput(f"{file}: contains no rows of data{right}")
+    if "lane" in entry.texts:
+        names = _number_names(raw, cells)
     vehicle = np.zeros(len(raw), np.int64) if entry.gaps else pd.factorize(raw["vehicle"])[0]
     moment, between = moments(raw["time"].to_numpy() / entry.per_second, vehicle, every_s)
     places = raw.index
@@ -68,8 +76,6 @@ def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
     if entry.gaps:
         states = _openacc(raw, cells, entry)
     else:
-        if "lane" in entry.texts:
-            names = _number_names(raw, cells)
         states = _along_road(raw, cells, entry)
         if entry.title == "highD":
             _turn_highd(states, cells)
@@ -81,10 +87,48 @@ def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
     more, unread = interpolated(states, between)
     states = pd.concat([states[states["moment"] >= 0.0], more])
     states = states.sort_values(list(states), ignore_index=True)
-    recording = Recording(cells, entry, states, names, len(more), unread)
+    on_road = pd.concat([states, unread], ignore_index=True)
+    on_road["odd"] = False
+    if not entry.gaps:
+        on_road["odd"] = odd_places(on_road, every_s)
+    recording = Recording(cells, entry, on_road[: len(states)], names, len(more), on_road[len(states) :])
     if not entry.gaps:
         _check_positions(recording, every_s)
     return recording
+
+
+def odd_places(states: Any, every_s: float) -> Bools:
+    """Whether a vehicle's other places contradict the place of a state, such as a mark of a missing value, [states].
+
+    From the longest part of a vehicle's way without a contradiction, the search goes on to both sides, past places that
+    contradict the last one that did not. If half of the places are odd, all are.
+    """
+    odd = np.zeros(len(states), np.bool_)
+    columns = states[["front", "side", "dx", "dy", "speed"]].to_numpy()
+    times_s = states["moment"].to_numpy() * every_s
+
+    def contradicts(early: Any, late: Any) -> Any:
+        (x, y, dx, dy, v), (x_then, y_then, _, _, v_then) = columns[early].T, columns[late].T
+        way, time_s = (x_then - x) * dx + (y_then - y) * dy, times_s[late] - times_s[early]
+        error = np.abs(way - (v + v_then) / 2.0 * time_s)
+        is_possible = (way >= -NOISE_M) & (way <= FASTEST_MPS * time_s + NOISE_M)
+        return ~(is_possible & (error <= NOISE_M + HARDEST_MPS2 / 4.0 * time_s**2))
+
+    for places in states.groupby("vehicle").indices.values():
+        places = places[np.argsort(times_s[places], kind="stable")]
+        jumps = np.flatnonzero(contradicts(places[:-1], places[1:])) + 1
+        if not len(jumps):
+            continue
+        longest = max(np.split(places, jumps), key=len)
+        first, last = longest[0], longest[-1]
+        for place in places[places.tolist().index(last) + 1 :]:
+            odd[place] = contradicts(last, place)
+            last = last if odd[place] else place
+        for place in places[: places.tolist().index(first)][::-1]:
+            odd[place] = contradicts(place, first)
+            first = first if odd[place] else place
+        odd[places] |= 2 * odd[places].sum() >= len(places)
+    return odd
 
 
 def moments(times_s: Floats, vehicle: Ints, every_s: float) -> tuple[Floats, Between]:
@@ -117,13 +161,19 @@ def moments(times_s: Floats, vehicle: Ints, every_s: float) -> tuple[Floats, Bet
 def _number_names(raw: Any, cells: Cells) -> dict[float, str]:
     """Names of vehicles and lanes, number -> name; in ``raw``, the numbers replace them."""
     for column in ("vehicle", "lane"):
-        cells.refuse(raw[column] == "", column, raw[column], "must be a name")
+        cells.refuse(raw[column].str.lower().isin(NO_NAME), column, raw[column], "must be a name")
     text = pd.concat([raw["vehicle"], raw["lane"]]).drop_duplicates()
     names = pd.DataFrame({"number": pd.to_numeric(text, errors="coerce"), "text": text}).sort_values(["number", "text"])
-    numbers = {name: float(k) for k, name in enumerate(names["text"])}
+    exact = {name: exact_name(name) for name in names["text"]}
+    numbers = {key: float(k) for k, key in enumerate(dict.fromkeys(exact.values()))}
     for column in ("vehicle", "lane"):
-        raw[column] = raw[column].map(numbers)
-    return {number: plain_text(name) for name, number in numbers.items()}
+        raw[column] = raw[column].map({name: numbers[key] for name, key in exact.items()})
+    return {numbers[key]: plain_text(name) for name, key in reversed(exact.items())}
+
+
+def exact_name(name: str) -> Decimal | str:
+    """Numbers that are equal, such as 1 and 1.0, are one name."""
+    return Decimal(name) if re.fullmatch(NUMERAL, name) else name
 
 
 def _along_road(raw: Any, cells: Cells, entry: Format) -> Any:
@@ -179,6 +229,8 @@ def _check(states: Any, cells: Cells, entry: Format) -> None:
 def _check_positions(recording: Recording, every_s: float) -> None:
     """Raise ``InvalidInput`` if, in some lane, positions change much more or less than speeds imply, or backwards."""
     cells, entry, now = recording.cells, recording.entry, recording.states
+    if now["odd"].mean() <= entry.impossible:
+        now = now[~now["odd"]]
     then = now[["moment", "vehicle", "lane", "front", "side", "speed"]].assign(moment=now["moment"] + 1.0)
     pairs = now.merge(then, on=["moment", "vehicle", "lane"], suffixes=("", "_then"))
     along = (pairs["front"] - pairs["front_then"]) * pairs["dx"] + (pairs["side"] - pairs["side_then"]) * pairs["dy"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from ethbrake_marl.extensions.rendering.scene import Motion, Scene
 from ethbrake_marl.motion.layout import Floats
 
 SMOOTH_FPS = 50  # frames per second in the window, and default of `step_frames`
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")  # variables, one of which names a display of Linux
 
 
 class Viewer:
@@ -93,12 +95,19 @@ def import_pygame(many: bool = False) -> Any:
     return pygame
 
 
-def start_display(many: bool = False) -> Any:
+def check_window(many: bool = False) -> None:
+    """Raise ``InvalidInput`` or ``MissingExtra`` if there can be no window. The display is not started."""
+    import_pygame(many)
+    if sys.platform == "linux" and not os.environ.keys() & DISPLAYS:
+        raise InvalidInput(f"there is no display: none of the variables {', '.join(DISPLAYS)} is set")
+
+
+def start_display() -> Any:
     """Start the display, and return the module pygame.
 
     Raises the errors of ``import_pygame``, and ``InvalidInput`` without a display.
     """
-    pygame = import_pygame(many)
+    pygame = import_pygame()
     with _refusing(pygame):
         pygame.display.init()
         if pygame.display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
@@ -119,7 +128,7 @@ def _refusing(pygame: Any) -> Iterator[None]:
 class Window(Viewer):
     """Viewer of the mode ``human``: a window that shows every step in real time. The user may close it."""
 
-    check = staticmethod(start_display)
+    check = staticmethod(check_window)
 
     def __init__(self, environment: Any) -> None:
         super().__init__(environment)

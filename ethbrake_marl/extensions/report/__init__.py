@@ -13,4 +13,4 @@ if TYPE_CHECKING:
     from ethbrake_marl.extensions.report.style import write_picture as write_picture
 
 else:
-    __getattr__ = front_door(__name__, __file__)
+    __getattr__ = front_door(__name__)

@@ -106,7 +106,7 @@ def reproduce(
     made_by = (
         f"`{command_line(settings, items)}` on {today} ({machine}; version {__version__}, physics {physics_digest()})"
     )
-    write_output(folder / RESULTS_FILE, page(made_by, results).encode(), force=True)
+    write_output(folder / RESULTS_FILE, page(made_by, results).encode(), force=force)
     return results
 
 

@@ -23,11 +23,11 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 from ethbrake_marl.evaluation.statistics import difference, mean, rate, unpaired_difference
 from ethbrake_marl.extensions.reproduction.readings import OURS, READINGS
+from ethbrake_marl.files.package import package_folder
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.motion.layout import Bools, Floats
@@ -60,17 +60,20 @@ def same_claim(name: str, text: str, verdict: Verdict, share: str = "") -> Claim
     return Claim(name, {OURS: Result(text, verdict)}, share)
 
 
+FOLDER = package_folder() / "extensions" / "reproduction"
+
+
 @cache
 def paper_texts() -> Mapping[str, Any]:
     """Content of ``sentences.yaml``: sentences of the paper with our reasons."""
-    content: Mapping[str, Any] = read_yaml(Path(__file__).with_name("sentences.yaml")).content
+    content: Mapping[str, Any] = read_yaml(FOLDER / "sentences.yaml").content
     return content
 
 
 @cache
 def recorded() -> Mapping[str, Any]:
     """Content of ``recorded.yaml``: results that rest on a training."""
-    content: Mapping[str, Any] = read_yaml(Path(__file__).with_name("recorded.yaml")).content
+    content: Mapping[str, Any] = read_yaml(FOLDER / "recorded.yaml").content
     return content
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.episode.counts import HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, describe_error
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, UInt64s, best_of
+from ethbrake_marl.files.package import package_folder
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.store import write_file
 from ethbrake_marl.motion.digest import physics_digest
@@ -25,7 +26,7 @@ from ethbrake_marl.motion.layout import Floats
 
 TABLE_FORMAT = 2
 SIZE_LIMIT_BYTES, UNPACKED_LIMIT_BYTES = 64 << 20, 256 << 20
-TABLE_FOLDER = Path(__file__).resolve().parents[2] / "shipped" / "tables"
+TABLE_FOLDER = package_folder() / "shipped" / "tables"
 ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # entries of the header that messages show
 ARRAYS = {"identity": ("<u8", 1)}  # name of an array -> its type and number of axes,
 OF_COUNT = {"harm": ("<f8", 1), "ends": ("<u2", 2), "commands": ("<f8", 3)}  # and of those of one count of harm

@@ -87,7 +87,9 @@ def test_gap_of_0_or_less__of_a_standing_car_is_left_out_of_moving_ones_one_in_a
     assert "left out: 2 links of standing cars whose gap was recorded as 0 or less" in made.found
     few, many = ["20,20,20,20,-1,16,17"] * 1, ["20,0.5,20,20,-1,16,17"] * 2
     made = scenario_from_data("mine", openacc(tmp_path, columns, *[good] * 24, *few), "openacc")  # 1 of 100 vehicles
-    assert "left out: 1 vehicles that overlap, are recorded twice, or follow one that is not recorded" in made.found
+    assert (
+        "left out: 1 vehicles that overlap, jump, are recorded twice, or follow one that is not recorded" in made.found
+    )
     with pytest.raises(
         InvalidInput,
         match=r"line 25: vehicle 2 overlaps vehicle 1 ahead by 1\.00 m; 2 of 100 positions of vehicles are faulty",

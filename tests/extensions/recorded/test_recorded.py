@@ -116,10 +116,11 @@ def test_overlaps__are_refused_but_few_of_noisy_data_are_left_out(tmp_path: Path
     head = next(line for line in text.splitlines() if line.startswith("4,"))  # of the second queue, twice
     file.write_text(re.sub(r"(?m)^(2,0,11,\d+,20),[^,]+", r"\1,99", text) + head + "\n")
     made = scenario_from_data("mine", file.parent, "ngsim")
-    assert len(rows_of(made)) == 39 and "left out: 2 vehicles that overlap" in made.found[2]
+    assert len(rows_of(made)) == 38 and "left out: 3 vehicles that overlap" in made.found[3]
     file.write_text(re.sub(r"(?m)^((?:2|5|8|11|14|17),\d+,11,\d+,20),[^,]+", r"\1,99", text))
     with pytest.raises(
-        InvalidInput, match=r"line \d+: vehicle 2 overlaps .*; 12 of 120 positions of vehicles are faulty"
+        InvalidInput,
+        match=r"line \d+: vehicle 2 is at a place that contradicts .*; 12 of 120 positions of vehicles are",
     ):
         scenario_from_data("mine", file.parent, "ngsim")
 

@@ -194,3 +194,63 @@ def test_frames_of_video__keep_their_rate_and_names_of_columns_are_literal(tmp_p
     columns = "time=t/29.97,vehicle=veh#,lane=lane,front=x,length=l,speed=v,units=m"
     made = made_of(folder, columns, based_on="realistic-pair")
     assert rows_of(made) == ["15.0,20.0,20.0"] * 21
+
+
+def platoon(**marked: float) -> list[tuple[object, ...]]:
+    """Twenty cars of 5 m at 20 m/s, 25 m apart, for 40 s; ``marked``: the place of car c10 at some times."""
+    cars: list[tuple[object, ...]] = []
+    for k in range(20):
+        for t in range(41):
+            place = 600.0 - 25.0 * k + 20.0 * t
+            cars.append((f"c{k}", float(t), "m", marked.get(f"t{t}", place) if k == 10 else place, 5.0, 20.0))
+    return cars
+
+
+MARKS = (0.0, -1.0, -999.0, -1073741824.0, 9999.0)
+
+
+@pytest.mark.parametrize("mark", MARKS)
+@pytest.mark.parametrize("times", [(12, 13), (0, 1), (39, 40), (7,)], ids=str)
+def test_mark_of_a_missing_place__is_a_fault_of_its_vehicle(
+    mark: float, times: tuple[int, ...], tmp_path: Path
+) -> None:
+    made = made_of(table(tmp_path, platoon(**{f"t{t}": mark for t in times})), based_on="realistic-pair")
+    assert {row.split(",")[0] for row in rows_of(made)} == {"20.0"} and len(rows_of(made)) == 10 * (41 - len(times))
+    assert any(f"left out: {len(times)} vehicles that overlap, jump, are recorded" in line for line in made.found)
+    assert f"left out: {19 * len(times)} links in a lane where the place of a vehicle" in "".join(made.found)
+
+
+@pytest.mark.parametrize("mark", MARKS)
+def test_marks_of_missing_places__are_refused_where_they_are_many(mark: float, tmp_path: Path) -> None:
+    """Each vehicle by itself: jumps of one lane cancel each other."""
+    marks = {f"t{t}": mark for t in range(10, 20)}
+    with pytest.raises(InvalidInput, match=r"vehicle c10 is at a place that contradicts .*; 10 of 820 positions"):
+        made_of(table(tmp_path, platoon(**marks)), based_on="realistic-pair")
+    few = [(who, t, lane, mark if who == "b" and t == 0.5 else x, *more) for who, t, lane, x, *more in CARS]
+    with pytest.raises(InvalidInput, match="vehicle b is at a place that contradicts"):
+        made_of(table(tmp_path, few), every_s=0.5)
+
+
+def test_numbers_that_are_equal__are_one_lane_and_one_vehicle(tmp_path: Path) -> None:
+    def named(who: object, lane: object) -> list[tuple[object, ...]]:
+        lanes = {"E1_0": "1", "E1_1": "2"}
+        return [(who if w == "b" else w, t, lane if w == "b" else lanes[str(p)], *rest) for w, t, p, *rest in CARS]
+
+    for who, lane in (("b", "1"), ("b", "1.0"), ("b", "01"), ("b", "1."), ("b", "+1.00")):
+        assert rows_of(made_of(table(tmp_path, named(who, lane)))) == ROWS
+    mixed = [(7 if t < 0.5 else "7.0", t, *rest) if w == "b" else (w, t, *rest) for w, t, *rest in CARS]
+    made = made_of(table(tmp_path, mixed), every_s=0.5)
+    assert rows_of(made) == [ROWS[0]] * 3 and made.csv.count("a.csv: c-7-a\n") == 3
+    for lane in ("2", "1.5", "1e", "lane 1", "9007199254740993"):
+        other = [(w, t, "9007199254740992" if lane[0] == "9" and p == "E1_0" else p, *rest) for w, t, p, *rest in CARS]
+        cars = [(w, t, lane if w == "b" else p, *rest) for w, t, p, *rest in other]
+        assert made_of(table(tmp_path, cars), based_on="realistic-pair").csv.count("c-b") == 0
+
+
+@pytest.mark.parametrize("column", ["who", "lane"])
+@pytest.mark.parametrize("mark", ["", "nan", "NaN", "None", "null"])
+def test_name__that_is_missing_is_refused(column: str, mark: str, tmp_path: Path) -> None:
+    at = HEAD.index(column)
+    cars = [tuple(mark if c == at and k == 3 else cell for c, cell in enumerate(car)) for k, car in enumerate(CARS)]
+    with pytest.raises(InvalidInput, match=rf"line 5, column {column}: .*must be a name"):
+        made_of(table(tmp_path, cars))

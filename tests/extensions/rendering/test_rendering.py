@@ -182,8 +182,9 @@ def modes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> li
     elif request.param == "the package pygame":
         monkeypatch.delattr(pytest.importorskip("pygame"), "Window")
     elif request.param == "no display":
-        pytest.importorskip("pygame").display.quit()
-        monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
+        pytest.importorskip("pygame")
+        for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
+            monkeypatch.delenv(name, raising=False)
     else:
         pytest.importorskip("pygame")
         monkeypatch.setattr("ethbrake_marl.extensions.rendering.viewer.SMOOTH_FPS", 1000)  # no waiting
@@ -200,6 +201,22 @@ def test_render_modes__are_those_that_work_here_and_the_checkers_of_libraries_pa
         warnings.filterwarnings("ignore", ".*not within.*")
         check_env(made.unwrapped)
     render_test(raw_env)
+
+
+def test_display__is_started_only_for_human(monkeypatch: pytest.MonkeyPatch) -> None:
+    pygame, started = pytest.importorskip("pygame"), list[str]()
+    monkeypatch.setattr(pygame.display, "init", lambda: started.append("display"))
+    many = [gymnasium.make_vec("EthBrake-v3", 2), EthBrakeVectorEnv(2), make_sb3_vec_env("paper-random", 2)]
+    for mode in (None, "rgb_array", "ansi"):
+        for env in (gymnasium.make("EthBrake-v3", render_mode=mode), EthBrakeEnv(render_mode=mode), raw_env()):
+            env.reset(seed=7)
+            assert "ansi" in env.metadata["render_modes"] and str(env) and not started
+    assert all(str(env) for env in many) and not started
+    human = EthBrakeEnv(render_mode="human")
+    assert not started  # before there is something to show
+    human.reset(seed=7)
+    assert started
+    human.close()
 
 
 def test_human__with_the_module_of_another_package_names_both_packages(monkeypatch: pytest.MonkeyPatch) -> None:
