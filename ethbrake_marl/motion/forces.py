@@ -24,7 +24,7 @@ from ethbrake_marl.motion.layout import (
     Floats,
 )
 
-FULL_MPS2 = 1e-5  # a command this near to the braking capacity is full braking: searches round commands
+FULL_MPS2 = 1e-5  # a force this near to the braking capacity is full: searches round commands
 ROUNDING_S = 1e-9  # an onset this shortly before the end of an interval is at its end
 
 
@@ -77,9 +77,10 @@ def capacities(car: Floats, row: int) -> Floats:
 
 
 @kernel
-def brakes_fully(car, scratch, i):
-    """Whether a command of full braking is in effect for body i: its brakes have or build up all their force."""
-    return scratch[ACTIVE, i] == 1.0 and scratch[COMMAND, i] <= FULL_MPS2 - capacity(car, BRAKING, i)
+def brakes_fully(line, car, scratch, i):
+    """Whether body i brakes with full force, and keeps it until its command changes."""
+    command, full = scratch[COMMAND, i] * scratch[ACTIVE, i], FULL_MPS2 - capacity(car, BRAKING, i)
+    return command <= full and force_now(line[FORCE, i], command, car[BRAKE_RATE, i], car[RELEASE_RATE, i]) <= full
 
 
 @kernel

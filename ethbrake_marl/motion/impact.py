@@ -29,6 +29,8 @@ from ethbrake_marl.motion.layout import (
     BLOCK_MASS,
     CLOSING,
     CONTACT_SPEED,
+    EASED,
+    FOREIGN,
     FRONT_CHANGE,
     GAP,
     HIT,
@@ -45,6 +47,7 @@ from ethbrake_marl.motion.layout import (
     PUSHED,
     REAR_CHANGE,
     RESTITUTION,
+    SHARED,
     SPEED,
     THROWN,
     ZERO,
@@ -143,20 +146,74 @@ def resolve_cluster(line, car, scratch, first, last):
             line[SPEED, i] = min(line[SPEED, i], line[SPEED, i - 1])
 
 
+@kernel
+def foreign_after(foreign, change, speed):
+    """Value of the row FOREIGN (m/s) once contacts have changed a body's speed by ``change`` to ``speed`` (m/s)."""
+    return min(max(foreign + change, 0.0), max(speed, 0.0))
+
+
 @part
 def note_thrown(line, car, scratch, p):
     """Add the change of pair p's closing speed in an impact to the row THROWN; the pair has had an impact before.
 
     If pair p itself closes in this impact, a part of the change takes up closing speed that forces had built up. This
-    part is added to the row PUSHED, and the rear vehicle answers for it (row ANSWERED), unless it brakes fully.
+    part is added to the row PUSHED.
     """
     change = (line[SPEED, p + 1] - scratch[BEFORE, p + 1]) - (line[SPEED, p] - scratch[BEFORE, p])
     closing = scratch[CLOSING, p]
     if closing > max(TOUCH_MPS, line[THROWN, p]):
         push = -change * min((closing - line[THROWN, p]) / closing, 1.0)
         line[PUSHED, p] += push
-        line[ANSWERED, p] += 0.0 if brakes_fully(car, scratch, p + 1) else push
+        note_answer(line, car, scratch, p, push)
     line[THROWN, p] += change
+
+
+@kernel
+def eases(line, car, scratch, i):
+    """Whether body i does not brake with full force, or has not since its last impact at the front (row EASED)."""
+    return line[EASED, i] == 1.0 or not brakes_fully(line, car, scratch, i)
+
+
+@part
+def divide_push(line, car, scratch, first, last, push, row):
+    """Add equal parts of a ``push`` (m/s) to ``row`` of the vehicles ``first..last``: all (SHARED), or all that ease
+    (ANSWERED). Returns whether there are any.
+    """
+    first, count = max(first, 1), 0
+    for i in range(first, last + 1):
+        count += 1 if row == SHARED or eases(line, car, scratch, i) else 0
+    for i in range(first, last + 1):
+        if row == SHARED or eases(line, car, scratch, i):
+            line[row, i - 1] += push / count
+    return count > 0
+
+
+@part
+def note_nobodys(line, car, scratch, first, last, push, backward):
+    """Add a ``push`` (m/s) for which nobody behind answers to the rows of the vehicles ``first..last``, which touch.
+
+    Where they move ``backward``, brakes press forward, and those that ease answer. Otherwise all share the push.
+    """
+    if not (backward and divide_push(line, car, scratch, first, last, push, ANSWERED)):
+        divide_push(line, car, scratch, first, last, push, SHARED)
+
+
+@part
+def note_answer(line, car, scratch, p, push):
+    """Add the ``push`` (m/s) of an impact of pair p to the rows of those that bear it.
+
+    The rear body answers if it eases, otherwise the bodies that touch it from behind and ease, otherwise nobody.
+    """
+    first, last = p, p + 1
+    while first > 0 and line[GAP, first - 1] <= 0.0:
+        first -= 1
+    while line[GAP, last] <= 0.0:
+        last += 1
+    if not (
+        divide_push(line, car, scratch, p + 1, p + 1, push, ANSWERED)
+        or divide_push(line, car, scratch, p + 2, last, push, ANSWERED)
+    ):
+        note_nobodys(line, car, scratch, first, last, push, scratch[BEFORE, p] < 0.0)
 
 
 @part
@@ -254,6 +311,8 @@ def resolve_impacts(line, car, scratch, now, ahead):
             resolve_cluster(line, car, scratch, first if struck < 0 else struck, last if struck < 0 else struck + 1)
             note_passed(line, car, scratch, first, last if struck < 0 else first)
         first = last + 1
+    for i in range(ahead, pairs + 1):
+        line[FOREIGN, i] = foreign_after(line[FOREIGN, i], line[SPEED, i] - scratch[BEFORE, i], line[SPEED, i])
     for p in range(ahead, pairs):
         scratch[CONTACT_SPEED, p] = 0.0
         if line[HIT, p] == 1.0:
@@ -262,6 +321,7 @@ def resolve_impacts(line, car, scratch, now, ahead):
             harm = scratch[CLOSING, p] * scratch[CLOSING, p]
             scratch[NEW_TOTAL, p] += harm
             scratch[NEW_IMPACTS, p] += 1.0
+            line[EASED, p + 1] = 0.0
             scratch[LAST_TIME, p] = now
             if scratch[NEXT_TIME, p] == math.inf:
                 scratch[NEXT_TIME, p], scratch[NEXT_CLOSING, p] = now, scratch[CLOSING, p]

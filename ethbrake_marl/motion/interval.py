@@ -12,22 +12,36 @@ import math
 
 from ethbrake_marl.motion.compiling import kernel, large, part
 from ethbrake_marl.motion.contact import contact, contact_on_cubic, first_return, gap_after
-from ethbrake_marl.motion.forces import acts, driving, force_now, force_range, plan_force, settle
-from ethbrake_marl.motion.impact import pool, resolve_impacts
+from ethbrake_marl.motion.forces import (
+    FULL_MPS2,
+    ROUNDING_S,
+    acts,
+    brakes_fully,
+    capacity,
+    driving,
+    force_now,
+    force_range,
+    plan_force,
+    settle,
+)
+from ethbrake_marl.motion.impact import foreign_after, pool, resolve_impacts
 from ethbrake_marl.motion.layout import (
     ACCELERATION,
     ACTIVE,
     BRAKE_RATE,
+    BRAKING,
     COMMAND,
     CONTACT_SPEED,
     CONTACT_TIME,
     DROVE,
+    EASED,
     FAR_M,
     FIRST,
     FORCE,
     FORCE_GOAL,
     FORCE_RATE,
     FORCE_TIME,
+    FOREIGN,
     FRONT_CHANGE,
     GAP,
     HIGH,
@@ -279,10 +293,30 @@ def move_apart(line, car, scratch, duration, ahead, builds):
                     return False
         slowest, front = min(speed, after), steady
     for i in range(ahead, bodies):
+        if line[FOREIGN, i] != 0.0:
+            own_speed = line[SPEED, i] - line[FOREIGN, i]
+            own_speed = solo(own_speed, scratch[COMMAND, i], scratch[ONSET, i], car[LIMIT, i], duration)[0]
+            line[FOREIGN, i] = scratch[SPEED_GOAL, i] - own_speed
+        if scratch[COMMAND, i] > FULL_MPS2 - capacity(car, BRAKING, i) and acts(scratch[ONSET, i], duration):
+            line[EASED, i] = 1.0
         line[SPEED, i] = scratch[SPEED_GOAL, i]
     for p in range(ahead, bodies - 1):
         line[GAP, p] = max(line[GAP, p] + (scratch[WAY, p] - scratch[WAY, p + 1]), 0.0)
     return True
+
+
+@part
+def note_history(line, car, scratch, duration, ahead):
+    """Update the rows EASED and FOREIGN for the ``duration`` (s) until the next event."""
+    for i in range(ahead, line.shape[1]):
+        if duration > ROUNDING_S and scratch[ACTIVE, i] == 1.0 and not brakes_fully(line, car, scratch, i):
+            line[EASED, i] = 1.0
+        change = (scratch[ACCELERATION, i] + 0.5 * scratch[JERK, i] * duration) * duration
+        own = (line[FORCE, i] + 0.5 * scratch[FORCE_RATE, i] * duration) * duration
+        if own != change or line[FOREIGN, i] != 0.0:
+            own_speed = max(line[SPEED, i] - line[FOREIGN, i], 0.0)
+            own = max(own, -own_speed) if own < 0.0 else min(own, max(car[LIMIT, i] - own_speed, 0.0))
+            line[FOREIGN, i] = foreign_after(line[FOREIGN, i], change - own, line[SPEED, i] + change)
 
 
 @kernel
@@ -319,6 +353,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds, exceeds, l
             parting = accelerate(line, car, scratch, ahead, builds)
             time_to_event = next_event(line, car, scratch, now, duration, parting, ahead, builds)
             add_push(line, car, scratch, time_to_event, ahead, builds)
+            note_history(line, car, scratch, time_to_event, ahead)
             if not move(line, scratch, time_to_event, ahead, builds):
                 break
             for i in range(ahead, bodies):
