@@ -11,11 +11,10 @@ honest  harm of every impact, also where a contact passes it on to another pair,
 
 All are in m2/s2 and never fall during an episode. Without the price of conduct, the best braking pushes Vehicle 1 away
 (docs/findings.md). The two vehicles of a pair share harm by their masses; each vehicle alone bears the price of the
-pushes for which it answers (``motion.push``), of its driving and of its motion. Vehicles in contact share the price of
-pushes for which nobody answers, so the harm that vehicles bear adds up to that of the line. ``register_count`` adds a
-count. A
-``harm_count`` is a name or a ``HarmCount``; the functions that users call turn it into a ``HarmCount``, which is then
-passed along.
+pushes for which it answers (``motion.push``), of its driving and of its motion. Those in contact share the price of a
+push for which nobody answers, so the harm that vehicles bear adds up to that of the line. ``register_count`` adds a
+count. A ``harm_count`` is a name or a ``HarmCount``; the functions that users call turn it into a ``HarmCount``, which
+is then passed along.
 """
 
 from __future__ import annotations

@@ -260,9 +260,9 @@ def stands(line, wanted):
 def note_motion(line, car):
     """Store what each vehicle's present motion costs (m2/s2) in the row MOVING of one world's ``line``.
 
-    The cost is ``v^2 - s^2``, with the speed v of the vehicle and its *free* speed s, which is at most v and not
-    negative. A scripted vehicle has as free speed what contacts have not given it (row FOREIGN), any other vehicle the
-    free speed of the vehicle ahead, and Vehicle 1 without a script 0.
+    The cost is ``v^2 - s^2``, with the speed v of the vehicle and its *free* speed s. Of a scripted vehicle, s is the
+    speed that its script commands: v without what it has from contacts (row FOREIGN). Of any other vehicle, s is the
+    free speed of the vehicle ahead (of Vehicle 1: 0), but at most v. It is 0 for a vehicle that moves backward.
     """
     free = 0.0
     for i in range(1, line.shape[1]):

@@ -77,10 +77,17 @@ def capacities(car: Floats, row: int) -> Floats:
 
 
 @kernel
+def is_full(force, car, i):
+    """Whether a ``force`` or command (m/s2) of body i is full braking."""
+    return force <= FULL_MPS2 - capacity(car, BRAKING, i)
+
+
+@kernel
 def brakes_fully(line, car, scratch, i):
     """Whether body i brakes with full force, and keeps it until its command changes."""
-    command, full = scratch[COMMAND, i] * scratch[ACTIVE, i], FULL_MPS2 - capacity(car, BRAKING, i)
-    return command <= full and force_now(line[FORCE, i], command, car[BRAKE_RATE, i], car[RELEASE_RATE, i]) <= full
+    command = scratch[COMMAND, i] * scratch[ACTIVE, i]
+    force = force_now(line[FORCE, i], command, car[BRAKE_RATE, i], car[RELEASE_RATE, i])
+    return is_full(command, car, i) and is_full(force, car, i)
 
 
 @kernel

@@ -147,9 +147,16 @@ def resolve_cluster(line, car, scratch, first, last):
 
 
 @kernel
-def foreign_after(foreign, change, speed):
-    """Value of the row FOREIGN (m/s) once contacts have changed a body's speed by ``change`` to ``speed`` (m/s)."""
-    return min(max(foreign + change, 0.0), max(speed, 0.0))
+def note_foreign(line, i, change, speed):
+    """Update the row FOREIGN of body i: contacts have changed its speed by ``change``, to ``speed`` (m/s)."""
+    line[FOREIGN, i] = min(max(line[FOREIGN, i] + change, 0.0), max(speed, 0.0))
+
+
+@part
+def note_changes(line, scratch, ahead):
+    """Update the row FOREIGN of all bodies after impacts; their speeds before are in the row BEFORE of ``scratch``."""
+    for i in range(ahead, line.shape[1]):
+        note_foreign(line, i, line[SPEED, i] - scratch[BEFORE, i], line[SPEED, i])
 
 
 @part
@@ -157,27 +164,28 @@ def note_thrown(line, car, scratch, p):
     """Add the change of pair p's closing speed in an impact to the row THROWN; the pair has had an impact before.
 
     If pair p itself closes in this impact, a part of the change takes up closing speed that forces had built up. This
-    part is added to the row PUSHED.
+    part is a push, to which its authors are noted.
     """
     change = (line[SPEED, p + 1] - scratch[BEFORE, p + 1]) - (line[SPEED, p] - scratch[BEFORE, p])
     closing = scratch[CLOSING, p]
     if closing > max(TOUCH_MPS, line[THROWN, p]):
         push = -change * min((closing - line[THROWN, p]) / closing, 1.0)
         line[PUSHED, p] += push
-        note_answer(line, car, scratch, p, push)
+        note_authors(line, car, scratch, p, push)
     line[THROWN, p] += change
 
 
 @kernel
 def eases(line, car, scratch, i):
-    """Whether body i does not brake with full force, or has not since its last impact at the front (row EASED)."""
+    """Whether body i brakes with less than full force, or has done so since its last impact in front (row EASED)."""
     return line[EASED, i] == 1.0 or not brakes_fully(line, car, scratch, i)
 
 
 @part
 def divide_push(line, car, scratch, first, last, push, row):
-    """Add equal parts of a ``push`` (m/s) to ``row`` of the vehicles ``first..last``: all (SHARED), or all that ease
-    (ANSWERED). Returns whether there are any.
+    """Divide a ``push`` (m/s) equally between the vehicles ``first..last``; return whether there are any.
+
+    ``row`` is SHARED, for all of them, or ANSWERED, for those that ease.
     """
     first, count = max(first, 1), 0
     for i in range(first, last + 1):
@@ -190,19 +198,19 @@ def divide_push(line, car, scratch, first, last, push, row):
 
 @part
 def note_nobodys(line, car, scratch, first, last, push, backward):
-    """Add a ``push`` (m/s) for which nobody behind answers to the rows of the vehicles ``first..last``, which touch.
+    """Note a ``push`` (m/s) for which nobody behind answers; the vehicles ``first..last`` touch.
 
-    Where they move ``backward``, brakes press forward, and those that ease answer. Otherwise all share the push.
+    If they move ``backward``, brakes press forward: those that ease answer. Otherwise all share the push.
     """
     if not (backward and divide_push(line, car, scratch, first, last, push, ANSWERED)):
         divide_push(line, car, scratch, first, last, push, SHARED)
 
 
 @part
-def note_answer(line, car, scratch, p, push):
-    """Add the ``push`` (m/s) of an impact of pair p to the rows of those that bear it.
+def note_authors(line, car, scratch, p, push):
+    """Note who bears the ``push`` (m/s) of an impact of pair p (rows ANSWERED and SHARED).
 
-    The rear body answers if it eases, otherwise the bodies that touch it from behind and ease, otherwise nobody.
+    The rear body answers if it eases; otherwise those that touch it from behind and ease; otherwise nobody.
     """
     first, last = p, p + 1
     while first > 0 and line[GAP, first - 1] <= 0.0:
@@ -311,8 +319,7 @@ def resolve_impacts(line, car, scratch, now, ahead):
             resolve_cluster(line, car, scratch, first if struck < 0 else struck, last if struck < 0 else struck + 1)
             note_passed(line, car, scratch, first, last if struck < 0 else first)
         first = last + 1
-    for i in range(ahead, pairs + 1):
-        line[FOREIGN, i] = foreign_after(line[FOREIGN, i], line[SPEED, i] - scratch[BEFORE, i], line[SPEED, i])
+    note_changes(line, scratch, ahead)
     for p in range(ahead, pairs):
         scratch[CONTACT_SPEED, p] = 0.0
         if line[HIT, p] == 1.0:

@@ -13,23 +13,21 @@ import math
 from ethbrake_marl.motion.compiling import kernel, large, part
 from ethbrake_marl.motion.contact import contact, contact_on_cubic, first_return, gap_after
 from ethbrake_marl.motion.forces import (
-    FULL_MPS2,
     ROUNDING_S,
     acts,
     brakes_fully,
-    capacity,
     driving,
     force_now,
     force_range,
+    is_full,
     plan_force,
     settle,
 )
-from ethbrake_marl.motion.impact import foreign_after, pool, resolve_impacts
+from ethbrake_marl.motion.impact import note_foreign, pool, resolve_impacts
 from ethbrake_marl.motion.layout import (
     ACCELERATION,
     ACTIVE,
     BRAKE_RATE,
-    BRAKING,
     COMMAND,
     CONTACT_SPEED,
     CONTACT_TIME,
@@ -41,7 +39,6 @@ from ethbrake_marl.motion.layout import (
     FORCE_GOAL,
     FORCE_RATE,
     FORCE_TIME,
-    FOREIGN,
     FRONT_CHANGE,
     GAP,
     HIGH,
@@ -293,12 +290,9 @@ def move_apart(line, car, scratch, duration, ahead, builds):
                     return False
         slowest, front = min(speed, after), steady
     for i in range(ahead, bodies):
-        if line[FOREIGN, i] != 0.0:
-            own_speed = line[SPEED, i] - line[FOREIGN, i]
-            own_speed = solo(own_speed, scratch[COMMAND, i], scratch[ONSET, i], car[LIMIT, i], duration)[0]
-            line[FOREIGN, i] = scratch[SPEED_GOAL, i] - own_speed
-        if scratch[COMMAND, i] > FULL_MPS2 - capacity(car, BRAKING, i) and acts(scratch[ONSET, i], duration):
+        if not is_full(scratch[COMMAND, i], car, i) and acts(scratch[ONSET, i], duration):
             line[EASED, i] = 1.0
+        note_foreign(line, i, 0.0, scratch[SPEED_GOAL, i])
         line[SPEED, i] = scratch[SPEED_GOAL, i]
     for p in range(ahead, bodies - 1):
         line[GAP, p] = max(line[GAP, p] + (scratch[WAY, p] - scratch[WAY, p + 1]), 0.0)
@@ -312,11 +306,8 @@ def note_history(line, car, scratch, duration, ahead):
         if duration > ROUNDING_S and scratch[ACTIVE, i] == 1.0 and not brakes_fully(line, car, scratch, i):
             line[EASED, i] = 1.0
         change = (scratch[ACCELERATION, i] + 0.5 * scratch[JERK, i] * duration) * duration
-        own = (line[FORCE, i] + 0.5 * scratch[FORCE_RATE, i] * duration) * duration
-        if own != change or line[FOREIGN, i] != 0.0:
-            own_speed = max(line[SPEED, i] - line[FOREIGN, i], 0.0)
-            own = max(own, -own_speed) if own < 0.0 else min(own, max(car[LIMIT, i] - own_speed, 0.0))
-            line[FOREIGN, i] = foreign_after(line[FOREIGN, i], change - own, line[SPEED, i] + change)
+        own = (scratch[LOW, i] + 0.5 * scratch[LOW_JERK, i] * duration) * duration
+        note_foreign(line, i, change - own, line[SPEED, i] + change)
 
 
 @kernel

@@ -28,13 +28,13 @@ TOTAL = 5  # harm of all its impacts (m2/s2)
 IMPACTS = 6  # number of its impacts
 PUSHED = 7  # push: closing speed that forces have built up and the pair's contact has taken up (m/s)
 DROVE = 8  # of the pair's rear vehicle: speed that its engine alone would have given it (m/s)
-MOVING = 9  # of the pair's rear vehicle: square of its speed at the horizon (m2/s2)
+MOVING = 9  # of the pair's rear vehicle: price of its motion at the horizon (m2/s2)
 THROWN = 10  # change of the closing speed by impacts since the pair last touched (m/s)
 PASSED = 11  # harm that the contact passes on in impacts, beyond the harm of its own closing speed (m2/s2)
-ANSWERED = 12  # of the pair's rear vehicle: part of all pushes for which this vehicle answers (m/s)
+ANSWERED = 12  # of the pair's rear vehicle: its part of the pushes for which somebody answers (m/s)
 SHARED = 13  # of the pair's rear vehicle: its part of the pushes for which nobody answers (m/s)
-EASED = 14  # 1 once the body has braked with less than full force after its latency and its last impact at the front
-FOREIGN = 15  # of the body: part of its speed that contacts have given it, not its own force (m/s)
+EASED = 14  # of the body: 1 if, after its latency and its last impact in front, its brakes have lacked full force
+FOREIGN = 15  # of the body: part of its speed that it has from contacts, not by its own force (m/s)
 LINE_ROWS = 16
 
 # rows of `car`
