@@ -54,6 +54,9 @@ def compare(seed: int, n: int, kind: tuple[int, bool, bool]) -> tuple[int, float
         pushed += end[at.PUSHED].sum()
         differ += np.abs(parts).max() > 0.05 + 0.02 * end[at.PUSHED].sum()
         assert end[[at.ANSWERED, at.SHARED]].sum() == pytest.approx(end[at.PUSHED].sum())
+        met = (rows[:, k, at.GAP, :-1] <= 0.0).any(axis=0) | (end[at.IMPACTS, :-1] > 0.0)
+        alone = ~met & ~np.append(met[1:], False)
+        assert not end[[at.ANSWERED, at.SHARED], :-1][:, alone].any()
     return int(differ), float(pushed)
 
 
