@@ -6,15 +6,15 @@ total   harm of every impact
 honest  harm of every impact, also where a contact passes it on to another pair, plus a price of conduct: 10 m/s times
         the push, which is closing speed that forces build up and a contact absorbs; 10 m/s times the speed that a
         vehicle's engine gives by driving; ``v^2`` for a vehicle that still moves at v at the horizon, as if it then hit
-        a standing object, unless a script prescribes this motion (``episode.step.note_motion``). The default everywhere
+        a standing object, unless a script commands this motion (``episode.step.note_motion``). The default everywhere
 ======  ================================================================================================================
 
 All are in m2/s2 and never fall during an episode. Without the price of conduct, the best braking pushes Vehicle 1 away
 (docs/findings.md). The two vehicles of a pair share harm by their masses; each vehicle alone bears the price of the
-pushes for which it answers (``motion.push``), of its driving and of its motion. All share the price of pushes for which
-nobody answers, so the harm that vehicles bear adds up to that of the line. ``register_count`` adds a count. A
-``harm_count`` is a name or a ``HarmCount``; the functions that users call turn it into a ``HarmCount``, which is then
-passed along.
+pushes for which it answers (``motion.push``), of its driving and of its motion. Those in contact share the price of a
+push for which nobody answers, so the harm that vehicles bear adds up to that of the line. ``register_count`` adds a
+count. A ``harm_count`` is a name or a ``HarmCount``; the functions that users call turn it into a ``HarmCount``, which
+is then passed along.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.layout import ANSWERED, DROVE, FIRST, MOVING, PASSED, PUSHED, TOTAL, Floats
+from ethbrake_marl.motion.layout import ANSWERED, DROVE, FIRST, MOVING, PASSED, PUSHED, SHARED, TOTAL, Floats
 from ethbrake_marl.registry import Registry
 
 COUNTED_ROWS = [FIRST, TOTAL, PASSED, PUSHED, DROVE, MOVING]  # rows of a line that a count can weigh
@@ -147,18 +147,9 @@ def unshared_amount(line, p, weights):
 
 
 @kernel
-def common_push(line):
-    """Each vehicle's part of the pushes for which nobody answers, in one world so far (m/s)."""
-    rest, vehicles = 0.0, line.shape[1] - 1
-    for p in range(vehicles):
-        rest += line[PUSHED, p] - line[ANSWERED, p]
-    return max(rest, 0.0) / vehicles
-
-
-@kernel
-def conduct_amount(line, p, common, weights):
-    """Price of conduct that the rear vehicle of pair ``p`` bears so far (m2/s2); ``common``: ``common_push``."""
-    pushed = weights[OF_PUSHED] * (line[ANSWERED, p] + common)
+def conduct_amount(line, p, weights):
+    """Price of conduct that the rear vehicle of pair ``p`` bears so far (m2/s2)."""
+    pushed = weights[OF_PUSHED] * (line[ANSWERED, p] + line[SHARED, p])
     return pushed + weights[OF_DROVE] * line[DROVE, p] + weights[OF_MOVING] * line[MOVING, p]
 
 
@@ -195,11 +186,10 @@ def cost_of_step(before, line, impact_harm, weights):
 def _amounts(line, weights, out):
     last = out.shape[2] - 1
     for k in range(out.shape[1]):
-        common = common_push(line[k])
         for p in range(last):
             out[0, k, p] = pair_amount(line[k], p, weights)
             out[1, k, p] = unshared_amount(line[k], p, weights)
-            out[2, k, p] = conduct_amount(line[k], p, common, weights)
+            out[2, k, p] = conduct_amount(line[k], p, weights)
         out[0, k, last] = out[1, k, last] = out[2, k, last] = 0.0
 
 

@@ -25,9 +25,11 @@ from ethbrake_marl.episode.state import (
 )
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.impact import TOUCH_MPS
 from ethbrake_marl.motion.interval import EVENT_BY_EVENT, FAILED, is_line_of_three, move_line, move_lines
 from ethbrake_marl.motion.layout import (
     FORCE,
+    FOREIGN,
     IMPACTS,
     LATENCY,
     MOVING,
@@ -258,16 +260,17 @@ def stands(line, wanted):
 def note_motion(line, car):
     """Store what each vehicle's present motion costs (m2/s2) in the row MOVING of one world's ``line``.
 
-    The cost is ``max(v^2 - s^2, 0)``, with the speed v of the vehicle and the forward speed s of the nearest scripted
-    vehicle ahead (0: there is none). The motion of a scripted vehicle costs nothing.
+    The cost is ``v^2 - s^2``, with the speed v of the vehicle and its *free* speed s. Of a scripted vehicle, s is the
+    speed that its script commands: v without what it has from contacts (row FOREIGN). Of any other vehicle, s is the
+    free speed of the vehicle ahead (of Vehicle 1: 0), but at most v. It is 0 for a vehicle that moves backward.
     """
-    prescribed = 0.0
+    free = 0.0
     for i in range(1, line.shape[1]):
-        squared = line[SPEED, i] * line[SPEED, i]
+        speed, foreign = line[SPEED, i], line[FOREIGN, i]
         if car[SCRIPTED, i] == 1.0:
-            line[MOVING, i - 1], prescribed = 0.0, squared if line[SPEED, i] > 0.0 else 0.0
-        else:
-            line[MOVING, i - 1] = max(squared - prescribed, 0.0)
+            free = speed - foreign if foreign > TOUCH_MPS else speed
+        free = max(min(free, speed), 0.0)
+        line[MOVING, i - 1] = speed * speed - free * free
 
 
 def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:

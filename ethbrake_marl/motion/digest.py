@@ -40,7 +40,7 @@ from ethbrake_marl.motion.layout import (
 DIGEST_WORLDS = 400  # of each number of vehicles
 INTERVALS_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # each with new commands
 # The results of the physics, in the order in which they are hashed. Where they stand in `line` does not matter, and
-# neither do other rows; a new result joins them at the end. ANSWERED, who answers for PUSHED, is not among them.
+# neither do other rows; a new result joins them at the end. Who bears PUSHED and why are not among them.
 RESULTS = [SPEED, FORCE, GAP, HIT, FIRST, TOTAL, IMPACTS, PUSHED, DROVE, MOVING, THROWN, PASSED]
 
 

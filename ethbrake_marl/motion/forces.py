@@ -24,7 +24,7 @@ from ethbrake_marl.motion.layout import (
     Floats,
 )
 
-FULL_MPS2 = 1e-5  # a command this near to the braking capacity is full braking: searches round commands
+FULL_MPS2 = 1e-5  # a force this near to the braking capacity is full: searches round commands
 ROUNDING_S = 1e-9  # an onset this shortly before the end of an interval is at its end
 
 
@@ -77,9 +77,17 @@ def capacities(car: Floats, row: int) -> Floats:
 
 
 @kernel
-def brakes_fully(car, scratch, i):
-    """Whether a command of full braking is in effect for body i: its brakes have or build up all their force."""
-    return scratch[ACTIVE, i] == 1.0 and scratch[COMMAND, i] <= FULL_MPS2 - capacity(car, BRAKING, i)
+def is_full(force, car, i):
+    """Whether a ``force`` or command (m/s2) of body i is full braking."""
+    return force <= FULL_MPS2 - capacity(car, BRAKING, i)
+
+
+@kernel
+def brakes_fully(line, car, scratch, i):
+    """Whether body i brakes with full force, and keeps it until its command changes."""
+    command = scratch[COMMAND, i] * scratch[ACTIVE, i]
+    force = force_now(line[FORCE, i], command, car[BRAKE_RATE, i], car[RELEASE_RATE, i])
+    return is_full(command, car, i) and is_full(force, car, i)
 
 
 @kernel

@@ -29,6 +29,8 @@ from ethbrake_marl.motion.layout import (
     BLOCK_MASS,
     CLOSING,
     CONTACT_SPEED,
+    EASED,
+    FOREIGN,
     FRONT_CHANGE,
     GAP,
     HIT,
@@ -45,6 +47,7 @@ from ethbrake_marl.motion.layout import (
     PUSHED,
     REAR_CHANGE,
     RESTITUTION,
+    SHARED,
     SPEED,
     THROWN,
     ZERO,
@@ -143,20 +146,82 @@ def resolve_cluster(line, car, scratch, first, last):
             line[SPEED, i] = min(line[SPEED, i], line[SPEED, i - 1])
 
 
+@kernel
+def note_foreign(line, i, change, speed):
+    """Update the row FOREIGN of body i: contacts have changed its speed by ``change``, to ``speed`` (m/s)."""
+    line[FOREIGN, i] = min(max(line[FOREIGN, i] + change, 0.0), max(speed, 0.0))
+
+
+@part
+def note_changes(line, scratch, ahead):
+    """Update the row FOREIGN of all bodies after impacts; their speeds before are in the row BEFORE of ``scratch``."""
+    for i in range(ahead, line.shape[1]):
+        note_foreign(line, i, line[SPEED, i] - scratch[BEFORE, i], line[SPEED, i])
+
+
 @part
 def note_thrown(line, car, scratch, p):
     """Add the change of pair p's closing speed in an impact to the row THROWN; the pair has had an impact before.
 
     If pair p itself closes in this impact, a part of the change takes up closing speed that forces had built up. This
-    part is added to the row PUSHED, and the rear vehicle answers for it (row ANSWERED), unless it brakes fully.
+    part is a push, to which its authors are noted.
     """
     change = (line[SPEED, p + 1] - scratch[BEFORE, p + 1]) - (line[SPEED, p] - scratch[BEFORE, p])
     closing = scratch[CLOSING, p]
     if closing > max(TOUCH_MPS, line[THROWN, p]):
         push = -change * min((closing - line[THROWN, p]) / closing, 1.0)
         line[PUSHED, p] += push
-        line[ANSWERED, p] += 0.0 if brakes_fully(car, scratch, p + 1) else push
+        note_authors(line, car, scratch, p, push)
     line[THROWN, p] += change
+
+
+@kernel
+def eases(line, car, scratch, i):
+    """Whether body i brakes with less than full force, or has done so since its last impact in front (row EASED)."""
+    return line[EASED, i] == 1.0 or not brakes_fully(line, car, scratch, i)
+
+
+@part
+def divide_push(line, car, scratch, first, last, push, row):
+    """Divide a ``push`` (m/s) equally between the vehicles ``first..last``; return whether there are any.
+
+    ``row`` is SHARED, for all of them, or ANSWERED, for those that ease.
+    """
+    first, count = max(first, 1), 0
+    for i in range(first, last + 1):
+        count += 1 if row == SHARED or eases(line, car, scratch, i) else 0
+    for i in range(first, last + 1):
+        if row == SHARED or eases(line, car, scratch, i):
+            line[row, i - 1] += push / count
+    return count > 0
+
+
+@part
+def note_nobodys(line, car, scratch, first, last, push, backward):
+    """Note a ``push`` (m/s) for which nobody behind answers; the vehicles ``first..last`` touch.
+
+    If they move ``backward``, brakes press forward: those that ease answer. Otherwise all share the push.
+    """
+    if not (backward and divide_push(line, car, scratch, first, last, push, ANSWERED)):
+        divide_push(line, car, scratch, first, last, push, SHARED)
+
+
+@part
+def note_authors(line, car, scratch, p, push):
+    """Note who bears the ``push`` (m/s) of an impact of pair p (rows ANSWERED and SHARED).
+
+    The rear body answers if it eases; otherwise those that touch it from behind and ease; otherwise nobody.
+    """
+    first, last = p, p + 1
+    while first > 0 and line[GAP, first - 1] <= 0.0:
+        first -= 1
+    while line[GAP, last] <= 0.0:
+        last += 1
+    if not (
+        divide_push(line, car, scratch, p + 1, p + 1, push, ANSWERED)
+        or divide_push(line, car, scratch, p + 2, last, push, ANSWERED)
+    ):
+        note_nobodys(line, car, scratch, first, last, push, scratch[BEFORE, p] < 0.0)
 
 
 @part
@@ -254,6 +319,7 @@ def resolve_impacts(line, car, scratch, now, ahead):
             resolve_cluster(line, car, scratch, first if struck < 0 else struck, last if struck < 0 else struck + 1)
             note_passed(line, car, scratch, first, last if struck < 0 else first)
         first = last + 1
+    note_changes(line, scratch, ahead)
     for p in range(ahead, pairs):
         scratch[CONTACT_SPEED, p] = 0.0
         if line[HIT, p] == 1.0:
@@ -262,6 +328,7 @@ def resolve_impacts(line, car, scratch, now, ahead):
             harm = scratch[CLOSING, p] * scratch[CLOSING, p]
             scratch[NEW_TOTAL, p] += harm
             scratch[NEW_IMPACTS, p] += 1.0
+            line[EASED, p + 1] = 0.0
             scratch[LAST_TIME, p] = now
             if scratch[NEXT_TIME, p] == math.inf:
                 scratch[NEXT_TIME, p], scratch[NEXT_CLOSING, p] = now, scratch[CLOSING, p]

@@ -12,8 +12,18 @@ import math
 
 from ethbrake_marl.motion.compiling import kernel, large, part
 from ethbrake_marl.motion.contact import contact, contact_on_cubic, first_return, gap_after
-from ethbrake_marl.motion.forces import acts, driving, force_now, force_range, plan_force, settle
-from ethbrake_marl.motion.impact import pool, resolve_impacts
+from ethbrake_marl.motion.forces import (
+    ROUNDING_S,
+    acts,
+    brakes_fully,
+    driving,
+    force_now,
+    force_range,
+    is_full,
+    plan_force,
+    settle,
+)
+from ethbrake_marl.motion.impact import note_foreign, pool, resolve_impacts
 from ethbrake_marl.motion.layout import (
     ACCELERATION,
     ACTIVE,
@@ -22,6 +32,7 @@ from ethbrake_marl.motion.layout import (
     CONTACT_SPEED,
     CONTACT_TIME,
     DROVE,
+    EASED,
     FAR_M,
     FIRST,
     FORCE,
@@ -279,10 +290,24 @@ def move_apart(line, car, scratch, duration, ahead, builds):
                     return False
         slowest, front = min(speed, after), steady
     for i in range(ahead, bodies):
+        if not is_full(scratch[COMMAND, i], car, i) and acts(scratch[ONSET, i], duration):
+            line[EASED, i] = 1.0
+        note_foreign(line, i, 0.0, scratch[SPEED_GOAL, i])
         line[SPEED, i] = scratch[SPEED_GOAL, i]
     for p in range(ahead, bodies - 1):
         line[GAP, p] = max(line[GAP, p] + (scratch[WAY, p] - scratch[WAY, p + 1]), 0.0)
     return True
+
+
+@part
+def note_history(line, car, scratch, duration, ahead):
+    """Update the rows EASED and FOREIGN for the ``duration`` (s) until the next event."""
+    for i in range(ahead, line.shape[1]):
+        if duration > ROUNDING_S and scratch[ACTIVE, i] == 1.0 and not brakes_fully(line, car, scratch, i):
+            line[EASED, i] = 1.0
+        change = (scratch[ACCELERATION, i] + 0.5 * scratch[JERK, i] * duration) * duration
+        own = (scratch[LOW, i] + 0.5 * scratch[LOW_JERK, i] * duration) * duration
+        note_foreign(line, i, change - own, line[SPEED, i] + change)
 
 
 @kernel
@@ -319,6 +344,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds, exceeds, l
             parting = accelerate(line, car, scratch, ahead, builds)
             time_to_event = next_event(line, car, scratch, now, duration, parting, ahead, builds)
             add_push(line, car, scratch, time_to_event, ahead, builds)
+            note_history(line, car, scratch, time_to_event, ahead)
             if not move(line, scratch, time_to_event, ahead, builds):
                 break
             for i in range(ahead, bodies):

@@ -4,8 +4,8 @@ Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, f
 In a row of pairs, column p is the pair (body p, body p + 1). Column 0 exists in every world: without an obstacle its
 gap is ``FAR_M``, and the physics leaves it out.
 
-Arrays that most functions share: ``line`` [13, N + 1] changes, ``car`` [10, N + 1] stays the same, ``scratch`` [38, N +
-1] is the working memory of one call. A batch of n worlds has one more axis in front: ``line`` [n, 13, N + 1], ``car``
+Arrays that most functions share: ``line`` [16, N + 1] changes, ``car`` [10, N + 1] stays the same, ``scratch`` [38, N +
+1] is the working memory of one call. A batch of n worlds has one more axis in front: ``line`` [n, 16, N + 1], ``car``
 [n, 10, N + 1].
 """
 
@@ -28,11 +28,14 @@ TOTAL = 5  # harm of all its impacts (m2/s2)
 IMPACTS = 6  # number of its impacts
 PUSHED = 7  # push: closing speed that forces have built up and the pair's contact has taken up (m/s)
 DROVE = 8  # of the pair's rear vehicle: speed that its engine alone would have given it (m/s)
-MOVING = 9  # of the pair's rear vehicle: square of its speed at the horizon (m2/s2)
+MOVING = 9  # of the pair's rear vehicle: price of its motion at the horizon (m2/s2)
 THROWN = 10  # change of the closing speed by impacts since the pair last touched (m/s)
 PASSED = 11  # harm that the contact passes on in impacts, beyond the harm of its own closing speed (m2/s2)
-ANSWERED = 12  # of the pair's rear vehicle: part of all pushes for which this vehicle answers (m/s)
-LINE_ROWS = 13
+ANSWERED = 12  # of the pair's rear vehicle: its part of the pushes for which somebody answers (m/s)
+SHARED = 13  # of the pair's rear vehicle: its part of the pushes for which nobody answers (m/s)
+EASED = 14  # of the body: 1 if, after its latency and its last impact in front, its brakes have lacked full force
+FOREIGN = 15  # of the body: part of its speed that it has from contacts, not by its own force (m/s)
+LINE_ROWS = 16
 
 # rows of `car`
 MASS = 0  # t; infinite: the obstacle

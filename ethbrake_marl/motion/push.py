@@ -18,7 +18,8 @@ Who answers for the push: the rear vehicle of the pair for what its own force ad
 u_own is its acceleration by its own force. Those behind it whose force presses on it answer for the rest: the bodies j
 with u_j above both u_own and u_front, up to the one with which the mean is u_rear, in proportion to mass times excess
 at the middle of the time between two events. A body that brakes with all it has answers for nothing; what
-nobody answers for belongs to all vehicles alike.
+nobody answers for belongs to all that move as one, alike. A block that a speed limit or forces that cancel keep at its
+speed is not at rest: no brakes hold it. For an impact, ``motion.impact.note_answer`` says who answers.
 
 Between two events each mean is a linear function of time, so the largest of them is piecewise linear and convex, and
 the integral is exact.
@@ -30,7 +31,7 @@ import math
 
 from ethbrake_marl.motion.compiling import kernel, part
 from ethbrake_marl.motion.forces import brakes_fully
-from ethbrake_marl.motion.impact import SAME_MPS2
+from ethbrake_marl.motion.impact import SAME_MPS2, note_nobodys
 from ethbrake_marl.motion.layout import (
     ACCELERATION,
     ANSWERED,
@@ -43,6 +44,7 @@ from ethbrake_marl.motion.layout import (
     PART,
     PART_RATE,
     PUSHED,
+    SPEED,
 )
 
 
@@ -110,20 +112,21 @@ def gain(car, scratch, body, last, toward, side, side_jerk, held, duration):
 
 
 @part
-def own_push(car, scratch, p, head, side, front, held, duration):
+def own_push(car, scratch, p, head, side, front, held, rests, duration):
     """Push (m/s) of pair p that the force of its rear body adds in ``duration`` (s).
 
     ``side`` and ``front`` are the rows of ``scratch`` with the accelerations by own forces of the bodies behind and in
-    front of the contact. ``head`` is the front body of those that move as one; other arguments as for ``gain``.
+    front of the contact. ``head`` is the front body of those that move as one; ``rests``: whether these are held at
+    rest. Other arguments as for ``gain``.
     """
     jerks = LOW_JERK - LOW
     own, rate = scratch[side, p + 1], scratch[side + jerks, p + 1]
-    if held:  # u_own is at least 0, u_front at most
+    if rests:  # u_own is at least 0, u_front at most
         scratch[PART, 0], scratch[PART_RATE, 0], scratch[PART, 1], scratch[PART_RATE, 1] = own, rate, 0.0, 0.0
         pressing = integral_of_largest(scratch[PART], scratch[PART_RATE], 2, duration)
         return pressing - gain(car, scratch, p, head, -1, front, front + jerks, True, duration)
-    gain(car, scratch, p, head, -1, front, front + jerks, False, duration)  # PART: minus the means of the bodies i to p
-    count = p - head + 1
+    gain(car, scratch, p, head, -1, front, front + jerks, held, duration)  # PART: minus the means of the bodies i to p
+    count = p - head + (2 if held else 1)
     for k in range(count):
         scratch[PART, k] += own
         scratch[PART_RATE, k] += rate
@@ -157,31 +160,37 @@ def excess(car, scratch, j, side, time, level):
 
 @part
 def note_answers(line, car, scratch, p, head, tail, side, front, held, duration, push):
-    """Add the parts of pair p's ``push`` (m/s) for which vehicles answer to the row ANSWERED of ``line``.
+    """Add the parts of pair p's ``push`` (m/s) to the rows of ``line`` with the parts that vehicles bear.
 
     ``tail`` is the last body of those that move as one. Other arguments: as for ``own_push``.
     """
-    rear = p + 1
-    part_of_rear = min(own_push(car, scratch, p, head, side, front, held, duration), push)
+    rear, rests = p + 1, held and line[SPEED, p] == 0.0
+    part_of_rear = min(own_push(car, scratch, p, head, side, front, held, rests, duration), push)
     rest, pressing, time, level, last = push - part_of_rear, 0.0, 0.0, 0.0, rear
-    if not brakes_fully(car, scratch, rear):
+    nobodys = push
+    if not brakes_fully(line, car, scratch, rear):
         line[ANSWERED, p] += part_of_rear
+        nobodys -= part_of_rear
     for attempt in range(3):  # at the middle; if nobody else presses then, at the end, or at the beginning
         if pressing == 0.0 and rest > 0.0:
             time = duration * (0.5, 1.0, 0.0)[attempt]
             level = scratch[side, rear] + scratch[side + LOW_JERK - LOW, rear] * time
-            level = max(level, 0.0 if held else -largest_mean(car, scratch, p, head, -1, front, time)[0])
+            ahead = 0.0 if rests else -largest_mean(car, scratch, p, head, -1, front, time)[0]
+            level = max(level, min(ahead, 0.0) if held else ahead)
             last = largest_mean(car, scratch, rear, tail, 1, side, time)[1]
             for j in range(rear + 1, last + 1):
                 pressing += excess(car, scratch, j, side, time, level)
     for j in range(rear + 1, last + 1):
-        if pressing > 0.0 and not brakes_fully(car, scratch, j):
-            line[ANSWERED, j - 1] += rest * (excess(car, scratch, j, side, time, level) / pressing)
+        if pressing > 0.0 and not brakes_fully(line, car, scratch, j):
+            part_of_j = rest * (excess(car, scratch, j, side, time, level) / pressing)
+            line[ANSWERED, j - 1] += part_of_j
+            nobodys -= part_of_j
+    note_nobodys(line, car, scratch, head, tail, max(nobodys, 0.0), line[SPEED, p] < 0.0)
 
 
 @kernel
 def add_push(line, car, scratch, duration, ahead, builds):
-    """Add the push of every pair in ``duration`` (s) to the row PUSHED of ``line``, and who answers for it to ANSWERED.
+    """Add the push of every pair in ``duration`` (s) to the row PUSHED of ``line``, and who bears it to other rows.
 
     No event happens in this time.
     """

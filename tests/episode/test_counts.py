@@ -17,7 +17,7 @@ from ethbrake_marl.episode.play import follow_plans, price
 from ethbrake_marl.episode.reward import RewardParams, reward_params
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.evaluate import evaluate
-from ethbrake_marl.motion.layout import ANSWERED, BRAKING, DRIVING, DROVE, MOVING, PUSHED
+from ethbrake_marl.motion.layout import ANSWERED, BRAKING, DRIVING, DROVE, MOVING, PUSHED, SHARED
 from ethbrake_marl.shields.step import StepShield
 from tests.contract.interfaces import CRASH, REST
 from tests.episode.lines import later, state_of
@@ -61,8 +61,9 @@ def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_h
     ({1: "full_brake"}, [0.0, 12.0**2 - 2.2**2, 9.0**2 - 2.2**2]),  # with 6 m/s2 for 1.3 s
     ({1: "coast", 2: "coast", 3: "coast"}, [0.0] * 3),
     ({3: "coast"}, [10.0**2, 12.0**2, 0.0]),
+    ({2: "full_brake"}, [10.0**2, 0.0, 9.0**2 - 4.2**2]),
 ])  # fmt: skip
-def test_motion_at_the_horizon__costs_what_no_script_prescribes(scripts: dict[int, str], moving: list[float]) -> None:
+def test_motion_at_the_horizon__costs_what_no_script_commands(scripts: dict[int, str], moving: list[float]) -> None:
     roles = {f"vehicle_{i}": scripts.get(i, "learner") for i in (1, 2, 3)}
     scenario = eb.Scenario(
         name="apart", vehicles=3, gaps_m=50, speeds_mps=[10, 12, 9], braking_capacity_mps2=6, driving_capacity_mps2=6,
@@ -74,6 +75,48 @@ def test_motion_at_the_horizon__costs_what_no_script_prescribes(scripts: dict[in
     last, cost = follow_plans(game, state, coasting, HONEST)
     assert last.line[0, MOVING].tolist() == near([*moving, 0.0]) and cost.tolist() == near([sum(moving)])
     assert last.departures == {"obstacle"}
+
+
+def ended(plan: Any, **settings: Any) -> State:
+    """The last state of one world in which the learners' actions are ``plan`` [T, L]; the last ones repeat."""
+    scenario = eb.Scenario(
+        name="end", **{
+            "vehicles": 3, "gaps_m": 10, "speeds_mps": 20, "braking_capacity_mps2": 6, "driving_capacity_mps2": 6,
+            "mass_t": 5, "latency_s": 0, "restitution": 0.0, "early_impacts": "keep", **settings,
+        }
+    )  # fmt: skip
+    _, game = open_game(scenario)
+    return follow_plans(game, game.reset(scenario.sample(1, seed=7)), np.array([plan]), HONEST)[0]
+
+
+def test_motion_at_the_horizon__is_free_only_as_a_script_commands_it() -> None:
+    # Vehicle 1 stands; Vehicle 2, eight times as heavy, coasts at 9 m/s and strikes it after 1 s: 8 m/s in common.
+    struck = {"vehicles": 2, "gaps_m": 9, "speeds_mps": [0, 9], "mass_t": [1, 8], "horizon_s": 1.0001}
+    last = ended([[0.0]], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"}, **struck)
+    assert last.line[0, MOVING, :2].tolist() == near([64.0, 64.0], rel=1e-3)
+    # A script that coasts at 4 m/s is thrown to 9: 4 of it is its own, also for the one behind, which has 7.
+    struck |= {"gaps_m": 6, "speeds_mps": [4, 10], "mass_t": [1, 5], "horizon_s": 1.0001}
+    last = ended([[0.0]], roles={"vehicle_1": "coast", "vehicle_2": "learner"}, **struck)
+    assert last.line[0, MOVING, :2].tolist() == near([9.0**2 - 4.0**2] * 2, rel=1e-3)
+    # Vehicle 2 pushes Vehicle 1, which brakes fully: its brakes alone would have stopped it after 10 / 6 s.
+    pushed = {"vehicles": 2, "gaps_m": 0, "speeds_mps": 10, "driving_capacity_mps2": 8, "horizon_s": 2}
+    last = ended([[1.0]], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"}, **pushed)
+    assert last.line[0, MOVING, :2].tolist() == near([12.0**2] * 2)
+    # after 1 s, 4 of 11 m/s is commanded
+    last = ended([[1.0]], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"}, **pushed | {"horizon_s": 1})
+    assert last.line[0, MOVING, :2].tolist() == near([11.0**2 - 4.0**2] * 2)
+
+
+def test_motion_at_the_horizon__has_the_discount_of_the_nearest_vehicle_ahead() -> None:
+    # Vehicle 1 coasts on at 20 m/s. Vehicle 2 brakes to rest, and Vehicle 3 comes at 20 m/s.
+    roles = {"vehicle_1": "coast", "vehicle_2": "learner", "vehicle_3": "learner"}
+    last = ended([[-1.0, 0.0]], roles=roles, gaps_m=[10, 90], horizon_s=4)
+    assert last.line[0, MOVING].tolist() == near([0.0, 0.0, 400.0, 0.0])
+    last = ended([[-1.0, 0.0]], roles=roles, gaps_m=[10, 90], horizon_s=2)  # Vehicle 2 still has 8 m/s
+    assert last.line[0, MOVING].tolist() == near([0.0, 0.0, 400.0 - 64.0, 0.0])
+    behind = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "coast"}
+    last = ended([[-1.0]], roles=behind, gaps_m=[10, 90], horizon_s=4)  # commanded, whatever it meets
+    assert not last.line[0, MOVING].any()
 
 
 def test_honest__adds_nothing_to_a_line_that_brakes_to_rest_and_prices_driving_there() -> None:
@@ -150,11 +193,14 @@ def test_borne_harm__sums_to_that_of_the_line(name: str) -> None:
         assert last.borne_harm().sum(axis=1) == near(cost, rel=1e-12)
         own = amounts(objectives_of("own", last.vehicles), None, last, HONEST)
         assert own.sum(axis=1) == near(cost, rel=1e-12) and (own >= 0.0).all()
-    common = last.line[:, PUSHED].sum(axis=1) / last.vehicles  # all brake with all they have
-    assert not last.line[:, ANSWERED].any()
+    assert not last.line[:, ANSWERED].any()  # all brake with all they have
     impacts = last.borne_harm(eb.HarmCount("impacts", [0, 1, 1, 0, 0, 0], "impact_harm", "impacts", (EXACT_IMPACTS,)))
     moving = np.where(last.moving[:, np.newaxis], np.nan, 0.0)
-    assert np.nan_to_num(last.borne_harm() - impacts + moving - 10.0 * common[:, np.newaxis]) == near(0.0, abs=1e-9)
+    shared = 10.0 * last.line[:, SHARED, :-1]
+    assert np.nan_to_num(last.borne_harm() - impacts + moving - shared) == near(0.0, abs=1e-9)
+    met = last.pair_hit | (last.line[:, PUSHED, 1:-1] > 0.0)
+    front, rear = (np.pad(met, ((0, 0), place)) for place in ((1, 0), (0, 1)))
+    assert not shared[~front & ~rear].any()  # who touches nobody
 
 
 def test_own__gains_nothing_by_leaning_back_on_brakes_that_are_weaker() -> None:

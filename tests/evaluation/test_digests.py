@@ -14,7 +14,7 @@ from ethbrake_marl.episode.departures import PLAIN_ROWS
 from ethbrake_marl.evaluation import provenance
 from ethbrake_marl.evaluation.provenance import worlds_sha256
 from ethbrake_marl.motion import digest
-from ethbrake_marl.motion.layout import CAR_NAMES, LINE_ROWS, Floats
+from ethbrake_marl.motion.layout import ANSWERED, CAR_NAMES, EASED, FOREIGN, LINE_ROWS, SHARED, Floats
 
 RECORDED = Path(__file__).parents[2] / "docs/results/benchmark/rules.csv"
 
@@ -45,7 +45,8 @@ def test_digest_of_the_physics__has_all_results_and_no_other_rows(monkeypatch) -
     assert digest_of(monkeypatch, lambda line: with_row(line, 0.0)) == plain
     assert digest_of(monkeypatch, lambda line: with_row(line, 1.0)) == plain  # a later result, which has no name yet
     digests = [digest_of(monkeypatch, changed(row)) for row in digest.RESULTS]
-    assert len({plain, *digests}) == 1 + len(digest.RESULTS) == LINE_ROWS  # all rows but ANSWERED
+    assert len({plain, *digests}) == 1 + len(digest.RESULTS)
+    assert set(range(LINE_ROWS)) - set(digest.RESULTS) == {ANSWERED, SHARED, EASED, FOREIGN}
 
 
 def test_digest_of_the_physics__does_not_depend_on_the_order_of_rows(monkeypatch) -> None:

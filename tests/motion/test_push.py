@@ -142,9 +142,36 @@ ANSWERS: dict[str, tuple[Any, Any, float, list[float], list[float]]] = {
         lines([0.0, 0.0], [20.0] * 3, force_mps2=[-6.0, 3.0, 1.0], brake_rate_mps3=[np.inf, 2.0, np.inf]),
         [-6.0, -2.0, 1.0], 1.5, [0.0, 11.375, 4.875], [0.0, 11.25, 5.0],
     ),
-    "brakes build up to their capacity": (  # -6 and -2 t: 6 - 2 t until 2 s
-        lines([0.0], [20.0, 20.0], braking_capacity_mps2=[16.0, 4.0], brake_rate_mps3=[np.inf, 2.0]), [-6.0, -4.0], 2.0,
-        [0.0, 8.0], [0.0, 0.0],
+    "brakes build up to their capacity": (  # -6 and -2 t until 2 s: 6 - 2 t; then -4 and nobody's: 2 for 1 s
+        lines([0.0], [20.0, 20.0], braking_capacity_mps2=[16.0, 4.0], brake_rate_mps3=[np.inf, 2.0]), [-6.0, -4.0], 3.0,
+        [0.0, 8.0 + 2.0], [0.0, 8.0],
+    ),
+    "an engine lets go while full braking is commanded": (  # -6; 3 - 12 t until 0.75 s: 9 - 12 t
+        lines([0.0], [20.0, 20.0], braking_capacity_mps2=6.0, force_mps2=[-6.0, 3.0], brake_rate_mps3=12.0), -6.0, 2.0,
+        [0.0, 3.375], [0.0, 3.375],
+    ),
+    "brakes let go": (  # -6; -6 + 6 t for 1 s
+        lines([0.0], [20.0, 20.0], braking_capacity_mps2=6.0, force_mps2=-6.0, release_rate_mps3=6.0), [-6.0, 0.0], 1.0,
+        [0.0, 3.0], [0.0, 3.0],
+    ),
+    "forces that cancel are no brakes that hold": (  # 5 - -2.5 behind; (-2.5 + 5) / 2 - -2.5 in front
+        lines([0.0, 0.0], [20.0] * 3, braking_capacity_mps2=2.5), [-2.5, -2.5, 5.0], 1.0,
+        [0.0, 3.75, 7.5], [0.0, 0.0, 11.25],
+    ),
+    "brakes hold the same forces at rest": (  # 5 on Vehicle 2; (-2.5 + 5) / 2 of it on Vehicle 1
+        lines([0.0, 0.0], [0.0] * 3, braking_capacity_mps2=2.5), [-2.5, -2.5, 5.0], 1.0,
+        [0.0, 1.25, 5.0], [0.0, 0.0, 6.25],
+    ),
+    "a speed limit holds nobody at rest": (  # 0 - -6 in front of Vehicle 2, 1 of it its own; 0 - -5.5 behind it
+        lines([0.0, 0.0], [20.0] * 3, mass_t=[5.0, 5.0, 20.0], speed_limit_mps=20.0, braking_capacity_mps2=6.0),
+        [-6.0, -5.0, 7.0], 1.0, [0.0, 6.0, 5.5], [0.0, 1.0, 5.0 + 5.5],
+    ),
+    "a speed limit of two that drive": (  # each keeps its limit: 0 - -6, and 0 - (-6 + 1) / 2
+        lines([0.0, 0.0], [20.0] * 3, mass_t=[5.0, 5.0, 20.0], speed_limit_mps=20.0), [-6.0, 1.0, 7.0], 1.0,
+        [0.0, 6.0, 2.5], [0.0, 6.0, 2.5],
+    ),
+    "backward, brakes press forward": (  # the front coasts backward and answers: 4 for 1 s
+        lines([0.0], [-10.0, -10.0], braking_capacity_mps2=4.0), [0.0, -4.0], 1.0, [0.0, 4.0], [4.0, 0.0],
     ),
     "full braking that is not yet in effect": (
         lines([0.0], [20.0, 20.0], braking_capacity_mps2=[16.0, 4.0], latency_s=[0.0, 1.0]), [-6.0, -4.0], 2.0,
@@ -173,7 +200,80 @@ def test_answers__by_hand(name: str) -> None:
     after, _, _ = driven(line, car, command, 0.0, until)
     assert after[0, at.PUSHED, :-1].tolist() == pytest.approx(pushes, abs=1e-7)
     assert after[0, at.ANSWERED, :-1].tolist() == pytest.approx(answers, abs=1e-7)
-    assert after[0, at.ANSWERED, -1] == 0.0
+    assert after[0, at.ANSWERED, -1] == after[0, at.SHARED, -1] == 0.0
+    assert after[0, [at.ANSWERED, at.SHARED]].sum() == pytest.approx(sum(pushes), abs=1e-7)
+
+
+def test_push_that_nobody_answers_for__is_shared_by_those_in_contact() -> None:
+    # Vehicle 3 presses on Vehicle 2 with 1 m/s2 for 1 s. Vehicle 1 is far ahead, Vehicle 4 follows 1 m behind.
+    line, car = lines([30.0, 0.0, 1.0], [20.0] * 4, braking_capacity_mps2=[7.0, 7.0, 6.0, 6.0])
+    after, _, _ = driven(line, car, [-7.0, -7.0, -6.0, -6.0], 0.0, 1.0)
+    assert after[0, at.PUSHED].tolist() == pytest.approx([0.0, 0.0, 1.0, 0.0, 0.0])
+    assert after[0, at.SHARED].tolist() == pytest.approx([0.0, 0.5, 0.5, 0.0, 0.0])
+    line, car = lines([0.0], [0.0, 0.0], obstacle_gap_m=0.0, braking_capacity_mps2=0.0)  # the obstacle has no part
+    after, _, _ = driven(line, car, [0.0, 0.0], 0.0, 1.0)
+    assert not after[0, at.SHARED].any()
+
+
+# Settings, commands with the time until which vehicles hold them, and the answers and shares (m/s). At 20 m/s, 1 m
+# apart, brakes 6, e = 0.5. Vehicle 1 brakes fully. If Vehicle 2 coasts until 1.1 s, they meet at 0.57735 s with 3.4641
+# m/s and again with -1.73205 + 6 x 0.52265 = 1.40385: a push of 2.10577.
+FULL, LATER = -6.0, 2.10577
+LATER_IMPACTS: dict[str, tuple[dict[str, Any], list[tuple[list[float], float]], list[float], list[float]]] = {
+    "who has coasted answers, although it brakes fully at the impact": (
+        {}, [([FULL, 0.0], 1.1), ([FULL, FULL], 3.0)], [0.0, LATER], [0.0, 0.0],
+    ),
+    "speed kept in the latency is nobody's, whatever the command": (
+        {"latency_s": [0.0, 1.1]}, [([FULL, 3.0], 1.1), ([FULL, FULL], 3.0)], [0.0, 0.0], [LATER / 2.0, LATER / 2.0],
+    ),
+    "impacts within the latency are the rear's": (  # again with 1.73205 after 0.57735 s
+        {"latency_s": [0.0, 1.3]}, [([FULL, FULL], 1.2)], [0.0, 1.5 * 1.73205], [0.0, 0.0],
+    ),
+    "who has coasted before the first impact alone does not answer for weaker brakes": (
+        # 2.1 m/s and 0.685 m at 0.3 s, then 1 m/s2: the first impact with 2.40416, the second with half of it
+        {"braking_capacity_mps2": [7.0, 6.0]}, [([-7.0, 0.0], 0.3), ([-7.0, FULL], 3.05)],
+        [0.0, 0.0], [0.90156, 0.90156],
+    ),
+    "one presses the one between towards the front, and brakes fully at the impact": (
+        # -6; (-6 + 3) / 2: with 3 m/s at 2/3 s, 1.5 apart; 0.45 at 1.1 s, push 0.675. Vehicle 3 on Vehicle 2: 9 x 1.1
+        {}, [([FULL, FULL, 3.0], 1.1), ([FULL] * 3, 2.0)], [0.0, 0.0, 9.9 + 0.675], [0.0, 0.0, 0.0],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LATER_IMPACTS)
+def test_answers_for_later_impacts__by_hand(name: str) -> None:
+    settings, commands, answers, shares = LATER_IMPACTS[name]
+    N, start = len(answers), 0.0
+    settings = {"braking_capacity_mps2": 6.0, **settings}
+    line, car = lines([1.0, 0.0][: N - 1], [20.0] * N, restitution=0.5, **settings)
+    for command, until in commands:
+        line, _, _ = driven(line, car, command, start, until)
+        start = until
+    assert line[0, at.ANSWERED, :-1].tolist() == pytest.approx(answers, abs=1e-4)
+    assert line[0, at.SHARED, :-1].tolist() == pytest.approx(shares, abs=1e-4)
+
+
+# The line, its commands, the end, and the speed (m/s) that every vehicle has from contacts.
+FOREIGN: dict[str, tuple[Any, Any, float, list[float]]] = {
+    "struck from behind": (lines([2.0], [4.0, 8.0]), 0.0, 1.0, [2.0, 0.0]),  # after 0.5 s both have 6
+    "struck and pushed on, although its brakes would have stopped it": (  # 6 - 1.5 x 1.5
+        lines([2.0], [4.0, 8.0], latency_s=[0.5, 9.0]), [-3.0, 0.0], 2.0, [3.75, 0.0],
+    ),
+    "pushed": (lines([0.0], [10.0, 10.0]), [-6.0, 0.0], 1.0, [3.0, 0.0]),  # 7 instead of 4
+    "pushed beyond standstill": (lines([0.0], [3.0, 3.0]), [-6.0, 8.0], 1.0, [4.0, 0.0]),
+    "slowed by the one ahead, then pushed": (  # Vehicle 2 has 5 of 10; 3 m/s2 of 1 t: after 1.5 s 5 + 1.5 in common
+        lines([0.0, 1.0], [0.0, 10.0, 5.0], latency_s=[9.0, 9.0, 0.0]), [0.0, 0.0, 3.0], 1.5, [6.5, 1.5, 0.0],
+    ),
+    "thrown back": (lines([9.0], [20.0, 0.0], obstacle_gap_m=5.0, restitution=0.1), 0.0, 1.0, [0.0, 0.0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_speed_from_contacts__by_hand(name: str) -> None:
+    (line, car), command, until, foreign = FOREIGN[name]
+    after, _, _ = driven(line, car, command, 0.0, until)
+    assert after[0, at.FOREIGN, 1:].tolist() == pytest.approx(foreign, abs=1e-7)
 
 
 def test_push__adds_up_from_interval_to_interval() -> None:

@@ -26,6 +26,7 @@ from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     FAR_M,
     FORCE,
+    FOREIGN,
     GAP,
     HIT,
     LATENCY,
@@ -295,7 +296,7 @@ def estimate_worlds(observer, time, limit, known, news, aged, line, place, fresh
                     speed, passed = moved_on(news[k, SAMPLE_SPEED, j], force, limit[k, j], age)
                 place[j] = news[k, PLACE, j] + passed if known[k, j, P_PLACE] else place[j - way]
                 fresh[j] = known[k, j, P_PLACE] and age <= 0.0
-                line[k, SPEED, j], line[k, FORCE, j] = speed, force
+                line[k, SPEED, j], line[k, FORCE, j], line[k, FOREIGN, j] = speed, force, 0.0
                 j += way
         for p in range(1, bodies - 1):
             if not (fresh[p] and fresh[p + 1]):

@@ -20,7 +20,6 @@ from ethbrake_marl.episode.counts import (
     HarmCount,
     all_counts,
     amount_so_far,
-    common_push,
     conduct_amount,
     pair_amount,
     unshared_amount,
@@ -379,14 +378,14 @@ def worth(line, shares, weights, aim):
     """
     if aim == WHOLE_LINE:
         return amount_so_far(line, weights)
-    value, from_ahead, common = 0.0, 0.0, common_push(line)
+    value, from_ahead = 0.0, 0.0
     for i in range(line.shape[1]):
         borne = from_ahead
         if i < line.shape[1] - 1:
             unshared = unshared_amount(line, i, weights)
             shared = pair_amount(line, i, weights) - unshared
             borne += shares[0, i] * shared
-            from_ahead = shares[1, i] * shared + shares[2, i] * conduct_amount(line, i, common, weights)
+            from_ahead = shares[1, i] * shared + shares[2, i] * conduct_amount(line, i, weights)
         value = max(value, borne) if aim == LARGEST else value + borne
     return value
 

@@ -10,9 +10,12 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.team import Team, play, play_to_end
+from ethbrake_marl.episode.counts import HONEST
 from ethbrake_marl.episode.layer import Layer
-from ethbrake_marl.episode.plans import CHANGES, COMMANDS, PLANS_KEY
+from ethbrake_marl.episode.plans import CHANGES, COMMANDS, PHASES, PLANS_KEY
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.extensions.forecasts.contacts import FORECAST_S
+from ethbrake_marl.extensions.forecasts.planner import foresee, make_plans, no_plans
 from ethbrake_marl.motion import layout as at
 from tests.episode.lines import later, state_of
 from tests.refused import refused
@@ -49,6 +52,26 @@ def test_phases__are_worth_what_they_promise() -> None:
     full, model, one, two, three = (result[name]["honest_cost"].mean() for name in names.split(","))
     assert one < 1.02 * model < 0.8 * full
     assert three < two < 0.92 * one
+
+
+@pytest.mark.parametrize("name", ["paper-random", "paper-random-obstacle", "stress-wide", "benchmark-truck"])
+def test_forecast_cost__is_what_the_game_counts(name: str) -> None:
+    # Vehicle 2 knows the line, and the others brake fully: a plan costs what was forecast, if all come to rest.
+    scenario = eb.load_scenario(name)
+    _, game = eb.open_game(scenario)
+    state, bodies = game.reset(scenario.sample(40, 3)), np.array([2])
+    plans, costs = make_plans(
+        state, foresee(state, 2), no_plans(state), np.full(40, np.inf), bodies, phases=PHASES, reaction_s=0.0,
+        time_step_s=scenario.time_step_s, count=HONEST, candidates=3,
+    )  # fmt: skip
+    last, rows = state, np.arange(40)
+    while not last.ended.all():
+        phase = (plans[:, CHANGES, 2] < last.time_s[:, np.newaxis] + 1e-6).sum(axis=1)
+        command = plans[rows, COMMANDS.start + phase, 2]
+        last, _ = game.step(last, np.maximum(command / last.braking_capacity_mps2[:, 1], -1.0)[:, np.newaxis])
+    met = ~last.moving & (last.time_s <= state.time_s + FORECAST_S)
+    assert costs[met, 0] == pytest.approx(last.harm("honest")[met], rel=1e-6, abs=1e-6)
+    assert met.sum() > 5 and (last.line[met][:, at.PUSHED] > 0.0).any()
 
 
 def test_changes_of_phase__fall_on_decisions() -> None:
