@@ -553,7 +553,7 @@ def cost_row(scenario: eb.Scenario, table: BestHarmTable) -> str:
         return f"| {name} | – | {best.mean():.3f} | – | {error}"
     ratio, seconds = bound.mean() / best.mean(), time.process_time() - start
     half = 1.96 * float(np.std(bound - ratio * best)) / best.mean() / alert.n**0.5
-    interval = f"{ratio:.1%} ({ratio - half:.1%} to {ratio + half:.1%})".replace("%", " %")
+    interval = f"{100.0 * ratio:.1f} % ({100.0 * (ratio - half):.1f} to {100.0 * (ratio + half):.1f})"
     return f"| {name} | {bound.mean():.3f} | {best.mean():.3f} | {interval} | {seconds / alert.n:.3f} s a world"
 
 

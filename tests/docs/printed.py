@@ -42,6 +42,7 @@ TABLES: dict[str, tuple[str, ...]] = {
     "| who drives Vehicle 2 | main test": _HONEST,
     "| who drives Vehicle 2 | knows | collisions | first-impact harm | total harm | honest cost": _HONEST,
     "| agent | what it does | knows": ("ethbrake evaluate --agents ladder --json",),
+    "| Vehicle 2 minimises the cost of": ("python docs/studies/whose_harm.py whose-harm.png",),
 }
 
 PICTURES: dict[str, tuple[str, ...]] = {
@@ -66,6 +67,7 @@ PICTURES: dict[str, tuple[str, ...]] = {
             ("latency", "paper/latency"),
             ("sampled-convergence", "sampling"),
             ("time-gaps", "time_gaps"),
+            ("whose-harm", "whose_harm"),
             ("regimes", "regimes"),
         )
     },

@@ -1,4 +1,4 @@
-"""The commands ``study ablate``, which compares levels of cooperation."""
+"""The command ``study ablate``, which compares levels of cooperation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ study_group = typer.Typer(
     rich_markup_mode=None,
     add_completion=False,
     help="Compare levels of cooperation.",
-    epilog=example("study ablate --quick --output runs/ablation-quick"),
+    epilog=example(
+        "study ablate --quick --output runs/ablation-quick",
+        "study ablate --sweep objective=social:0..90:15 --output runs/angle",
+    ),
 )
 
 
