@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agent_names import AgentSettings, make_agent
+from ethbrake_marl.agent_names import AgentSettings, make_agent, team_of
 from ethbrake_marl.agents.e_v2x_bm import Predicting
-from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MODEL
@@ -19,12 +18,12 @@ from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput, Unfamiliar
 from ethbrake_marl.extensions.search.best_harm import (
     SEARCH_BUDGET,
-    agent_commands,
     best_harm as search_best_harm,
+    driven_profiles,
     e_v2x_bm_profiles,
 )
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, have_one_objective, problem_of, with_braking
-from ethbrake_marl.extensions.search.search import refine, search_profiles
+from ethbrake_marl.extensions.search.search import search_profiles
 from ethbrake_marl.extensions.search.tables import best_stored, outdated_tables
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
@@ -33,7 +32,7 @@ from ethbrake_marl.worlds.roles import HOLDING_SCRIPTS, LEARNER
 from ethbrake_marl.worlds.scenario import Scenario
 
 MOST_CANDIDATES = 1_000_000
-START = {"honest": "plan"}  # name of a count -> agent whose commands ``best_harm`` improves, too
+START = {"honest": "plan"}  # name of a count -> agent with whose commands a search begins
 OTHER_START = "ppo"  # the agent for every other count
 DECISION_ROUNDING = 1e-6  # part of a step: a time this close before a decision counts as the decision
 
@@ -48,7 +47,7 @@ class BestHarm(Predicting):
     """Drives the best known commands: from a shipped table, or from a search, as if other learners braked fully.
 
     If they do, the harm that happens is the memory's ``predicted_harm``, to the last bit. If it is the only learner, it
-    never does more harm than E-V2X-BM and the agent of ``START``, whose commands are improved once more. Several
+    never does more harm than E-V2X-BM and the agent of ``START``, with whose commands its search begins. Several
     learners with one objective follow the joint optimum of an ablation: the best known commands of all of them
     together.
     """
@@ -120,18 +119,13 @@ class BestHarm(Predicting):
 
     def search(self, game: Game, alert: State, problem: Problem, body: int, steps: int) -> tuple[Floats, Floats]:
         """[n, ``steps``] m/s2, and what they cost, [n] m2/s2."""
-        profiles, values = search_profiles(problem, [e_v2x_bm_profiles(problem, alert)], budget=self.budget)
-        best = profiles.stepwise(steps)[:, :, 0]
-        if self.scenario.learners != (body,):
-            return best, values[self.harm_count.name]
-        start = START.get(self.harm_count.name, OTHER_START)
-        agent = make_agent(start, scenario=self.scenario)
-        assert not isinstance(agent, Team)
-        commands = agent_commands(problem, game, alert, Team(start, {body: agent}))[:, :, 0]
-        better = refine(problem, commands, budget=1)[1] < values[self.harm_count.name]
-        first = np.where(better[:, np.newaxis], commands, best[:, : commands.shape[1]])
-        best[:, : commands.shape[1]], harm = refine(problem, first, budget=self.budget)
-        return best, harm
+        starts = [e_v2x_bm_profiles(problem, alert)]
+        if self.scenario.learners == (body,):
+            start = START.get(self.harm_count.name, OTHER_START)
+            team = team_of(make_agent(start, scenario=self.scenario), self.scenario)
+            starts.append(driven_profiles(problem, game, alert, team))
+        profiles, values = search_profiles(problem, starts, budget=self.budget)
+        return profiles.stepwise(steps)[:, :, 0], values[self.harm_count.name]
 
 
 def single_learner_game(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:

@@ -183,15 +183,11 @@ def search_list(
     )
 
 
-def agent_commands(problem: Problem, game: Game, alert: State, team: Team) -> Floats:
-    """Commands of a team at all T decisions of ``problem``, [n, T, B] m/s2; at the end the last repeat."""
+def driven_profiles(problem: Problem, game: Game, alert: State, team: Team) -> Profiles:
+    """Commands of a team, as profiles with one phase for each change of command; at the end the last repeat."""
     bodies, states = sorted(team.drivers), play(game, alert, team)
     next(states)
     commands = np.stack([state.wanted[:, bodies] for _, state in states], axis=1)
-    return np.pad(commands, ((0, 0), (0, int(problem.last_step.max()) - commands.shape[1]), (0, 0)), mode="edge")
-
-
-def driven_profiles(problem: Problem, game: Game, alert: State, team: Team) -> Profiles:
-    """Commands of a team, as profiles with one phase for each change of command."""
-    steps = Profiles.of_steps(agent_commands(problem, game, alert, team), problem.last_step)
+    missing = int(problem.last_step.max()) - commands.shape[1]
+    steps = Profiles.of_steps(np.pad(commands, ((0, 0), (0, missing), (0, 0)), mode="edge"), problem.last_step)
     return Profiles.join([compact(*profile) for profile in zip(*steps, strict=True)])

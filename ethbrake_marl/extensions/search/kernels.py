@@ -27,8 +27,8 @@ RESOLUTION = 1048576.0  # commands are multiples of 1 / 2^20 m/s2: short to stor
 # places in `World.numbers`
 TIME_STEP, AIM, STEPWISE, NUMBERS = range(4)
 
-# how random profiles and changes are drawn: a whole profile, or three phases of a plan and changes of a few steps
-KIND, ATTENTION, LONGEST_CHANGE, LONGEST_WHILE, DRAWING = range(5)
+# how random changes are drawn: of a phase of a profile, or of some decisions of a plan
+KIND, ATTENTION, LONGEST_CHANGE, DRAWING = range(4)
 PROFILE, PLAN = 0, 1
 
 # a change, and its kinds
@@ -166,22 +166,9 @@ def draw_command(world, b):
 
 
 @large
-def draw_profile(world, drawing, ends, commands):
-    """Write a random profile to ``ends`` [K] and ``commands`` [K, B]; return its number of phases.
-
-    ``drawing`` [DRAWING]: PROFILE has six phases of random commands, most of them short; PLAN has three: often full
-    braking, another command for a while, and full braking.
-    """
+def draw_profile(world, ends, commands):
+    """Write six phases of random commands, most of them short, to ``ends`` [K] and ``commands`` [K, B]; return 6."""
     random, bounds, last = world.random, world.bounds, int(world.clock[LAST])
-    if drawing[KIND] == PLAN:
-        low = bounds[0, 0]
-        first = draw_below(random, drawing[ATTENTION])
-        ends[0], ends[1], ends[2] = first, first + 1 + draw_below(random, drawing[LONGEST_WHILE]), last
-        commands[1, 0], commands[2, 0] = draw_command(world, 0), low
-        commands[0, 0] = low if next_uniform(random) < 0.8 else draw_command(world, 0)
-        for p in range(3):
-            ends[p] = min(ends[p], last)
-        return 3
     step = 0
     for p in range(6):
         u = next_uniform(random)
@@ -271,7 +258,7 @@ def largest_place(values):
 
 
 @large
-def gather(world, room, ends, commands, phases, random_count, drawing, tolerance, field):
+def gather(world, room, ends, commands, phases, random_count, tolerance, field):
     """Fill ``field`` with the best of Q profiles and ``random_count`` random profiles; its places are not sorted.
 
     ``ends`` [Q, K], ``commands`` [Q, K, B], ``phases`` [Q]: the profiles (0 phases: empty place). Of profiles whose
@@ -284,7 +271,7 @@ def gather(world, room, ends, commands, phases, random_count, drawing, tolerance
         if s < number:
             copy_profile(ends[s], commands[s], room.ends, room.commands)
         else:
-            phase_count = draw_profile(world, drawing, room.ends, room.commands)
+            phase_count = draw_profile(world, room.ends, room.commands)
         if phase_count == 0:
             continue
         trial_ends, trial_commands = room.ends[:phase_count], room.commands[:phase_count]
@@ -302,8 +289,8 @@ def gather(world, room, ends, commands, phases, random_count, drawing, tolerance
 
 
 @large
-def improve(world, room, ends, commands, budget, drawing, least):
-    """Improve a profile in place by random changes, at most ``budget``, until its value is at most ``least`` (m2/s2).
+def improve(world, room, ends, commands, budget, drawing):
+    """Improve a profile in place by random changes, at most ``budget``, until its value is 0.
 
     A change that helps is repeated with twice the amount. A change that leaves the profile as it was costs no budget,
     unless ``drawing`` is of the kind ``PLAN``. Returns the value (m2/s2; infinite if it cannot be simulated), and the
@@ -317,7 +304,7 @@ def improve(world, room, ends, commands, budget, drawing, least):
         return math.inf, 0
     spent, again = 0, False
     for _ in range(4 * budget):
-        if spent >= budget or value <= least:
+        if spent >= budget or value <= 0.0:
             break
         if not again:
             draw_change(world, active, drawing, change)

@@ -24,14 +24,6 @@ SAME_VALUE = 1e-6  # profiles whose values (m2/s2) are closer count as the same
 LONGEST_TOGETHER = 50  # decisions that polishing changes at once
 ATTENTION_STEPS = 30  # phases are halved within this number of steps from the first decision
 
-# of a search around commands
-TEMPLATE_SHARE, IMPROVEMENT_SHARE = 0.3, 0.3  # parts of the budget for templates, and for improving the best of them
-ATTENTION_S = 3.0  # changes and templates begin within this time from the first decision
-LONGEST_CHANGE_S = 0.6
-LONGEST_WHILE_S = 0.8  # of the second command of a template
-WORSE = 5.0  # a template is improved if it is worse than the given commands by at most this (m2/s2)
-NO_HARM = 1e-9  # less (m2/s2) counts as none
-
 PROFILES = np.zeros(DRAWING, np.int64)  # `drawing` of the kind PROFILE
 
 
@@ -65,10 +57,10 @@ def search_profiles(
         last = int(problem.last_step[k])
         world, room = prepare_world(problem, k, random, last, True)
         step_ends, step_commands = np.arange(1, last + 1), np.ascontiguousarray(best.take([k]).stepwise(last)[0])
-        _, active = improve(world, room, step_ends, step_commands, polishing, PROFILES, 0.0)
+        _, active = improve(world, room, step_ends, step_commands, polishing, PROFILES)
         if len(problem.bodies) == 1 and active > 0:
-            together = np.array([PLAN, last, LONGEST_TOGETHER, 1])
-            _, active = improve(world, room, step_ends, step_commands, polishing // 2, together, 0.0)
+            together = np.array([PLAN, last, LONGEST_TOGETHER])
+            _, active = improve(world, room, step_ends, step_commands, polishing // 2, together)
         step_ends[max(active - 1, 0) :] = last
         return compact(step_ends, step_commands)
 
@@ -113,7 +105,7 @@ def search_world(world: World, room: Room, starts: Profiles, last: int, budget: 
     field = field_for(M, K, B)
     random_count = max(int(DRAWN_SHARE * budget) - len(starts.ends), 0)
     in_rounds, stepwise = int(ROUNDS_SHARE * budget), int(STEPWISE_SHARE * budget)
-    gather(world, room, *starts, (starts.ends == last).argmax(axis=1) + 1, random_count, PROFILES, SAME_VALUE, field)
+    gather(world, room, *starts, (starts.ends == last).argmax(axis=1) + 1, random_count, SAME_VALUE, field)
     sort(field, M)
     for stage in range(rounds + 2):
         survivors = max(M >> stage, 1)
@@ -128,7 +120,7 @@ def search_world(world: World, room: Room, starts: Profiles, last: int, budget: 
             phase_count = field.phases[m]
             if phase_count > 0 and field.values[0] > 0.0:
                 profile = field.ends[m, :phase_count], field.commands[m, :phase_count]
-                field.values[m], active = improve(world, room, *profile, profile_budget, PROFILES, 0.0)
+                field.values[m], active = improve(world, room, *profile, profile_budget, PROFILES)
                 field.ends[m, max(active - 1, 0) : phase_count] = last  # the episode ends before later phases begin
         sort(field, survivors)
     phase_count = field.phases[0]
@@ -168,40 +160,10 @@ def select(world: World, room: Room, starts: Profiles, field: Field) -> None:
     """Put the best of ``field`` and ``starts`` at index 0 of ``field``. Then ``world`` is simulated step by step."""
     world.numbers[STEPWISE] = 1.0
     best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
-    gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
-    gather(world, room, *starts, np.full(len(starts.ends), starts.ends.shape[1]), 0, PROFILES, 0.0, best)
+    gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, 0.0, best)
+    gather(world, room, *starts, np.full(len(starts.ends), starts.ends.shape[1]), 0, 0.0, best)
     for array, best_array in zip(field, best, strict=True):
         array[0] = best_array[0]
-
-
-def refine(problem: Problem, commands_mps2: Floats, *, budget: int) -> tuple[Floats, Floats]:
-    """Improve one vehicle's commands at T decisions; return the best, [n, T] m/s2, and their values, [n] m2/s2.
-
-    The result is at least as good as ``commands_mps2`` [n, T]. Small changes may miss the best commands, so the best of
-    some random *templates* (a command, another for a while, then full braking) is improved as well. Raises
-    ``PhysicsError`` for worlds that cannot be simulated.
-    """
-    plans = Profiles.of_steps(commands_mps2[:, :, np.newaxis].copy(), problem.last_step)
-    random = random_states(problem.identity, 0)
-    templates, improvement_budget = int(TEMPLATE_SHARE * budget), int(IMPROVEMENT_SHARE * budget)
-    times = ATTENTION_S, LONGEST_CHANGE_S, LONGEST_WHILE_S
-    drawing = np.array([PLAN, *(max(int(time / problem.time_step_s + 0.5), 1) for time in times)])
-    failed = []
-    for k, (ends, commands) in enumerate(zip(*plans, strict=True)):
-        world, room = prepare_world(problem, k, random, len(ends), True)
-        value, active = improve(world, room, ends, commands, budget - templates - improvement_budget, drawing, NO_HARM)
-        if active == 0:
-            failed.append(k)
-        elif value > NO_HARM:
-            best = field_for(1, 3, 1)
-            best.values[0] = value + WORSE
-            gather(world, room, *field_for(0, 3, 1)[:3], templates, drawing, 0.0, best)
-            template = np.ascontiguousarray(Profiles(best.ends, best.commands).stepwise(len(ends))[0])
-            if best.phases[0] and improve(world, room, ends, template, improvement_budget, drawing, NO_HARM)[0] < value:
-                commands[:] = template
-    if failed:
-        raise PhysicsError(dict.fromkeys(failed, "the given commands cannot be simulated"))
-    return plans.commands_mps2[:, :, 0], problem.value(problem.follow(plans))
 
 
 def random_states(identity: UInt64s, seed: int) -> UInt64s:

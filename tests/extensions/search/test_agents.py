@@ -75,7 +75,7 @@ def test_best_harm__minimises_the_objective_of_the_scenario_also_in_worlds_of_a_
 
 def test_best_harm__spares_one_vehicle_first_and_then_the_line() -> None:
     first = PAPER.replace(objective="weighted:1,1,1000")
-    result = eb.evaluate(first, "best_harm:200,full_brake,e_v2x_bm,vine-paper", episodes=10, harm_count="first")
+    result = eb.evaluate(first, "best_harm:200,full_brake,e_v2x_bm,ppo", episodes=10, harm_count="first")
     goal = {
         agent: 3.0 * (999.0 * each["first_impact_harm_3"] + each["first_impact_harm"]) / 1002.0
         for agent, each in result.columns.items()
@@ -83,7 +83,7 @@ def test_best_harm__spares_one_vehicle_first_and_then_the_line() -> None:
     best = result["best_harm:200"]
     assert best["predicted_harm"] == pytest.approx(goal["best_harm:200"], rel=1e-9)
     assert best["first_impact_harm"].mean() < result["full_brake"]["first_impact_harm"].mean()
-    assert (goal["best_harm:200"] <= goal["vine-paper"] + 1e-9).all()
+    assert (goal["best_harm:200"] <= goal["ppo"] + 1e-9).all()
     assert (goal["best_harm:200"] <= goal["e_v2x_bm"] + 1e-9).all()
 
 

@@ -14,15 +14,8 @@ from ethbrake_marl.extensions.search.best_harm import starting_profiles
 from ethbrake_marl.extensions.search.extremes import KEPT_PROFILES
 from ethbrake_marl.extensions.search.kernels import try_all
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles
-from ethbrake_marl.extensions.search.search import (
-    compact,
-    join_profiles,
-    prepare_world,
-    random_states,
-    refine,
-    search_profiles,
-)
-from ethbrake_marl.motion.layout import DROVE, MOVING, PUSHED, Floats
+from ethbrake_marl.extensions.search.search import compact, join_profiles, prepare_world, random_states, search_profiles
+from ethbrake_marl.motion.layout import DROVE, MOVING, PUSHED
 from tests.extensions.proofs.worlds import worlds
 from tests.refused import refused
 
@@ -71,11 +64,6 @@ def sampled() -> eb.State:
 @cache
 def paper() -> Problem:
     return problem_of(GAME, sampled())
-
-
-@cache
-def steady() -> Floats:
-    return np.full((6, int(paper().last_step.max())), -4.0)
 
 
 def grid(problem: Problem) -> Profiles:
@@ -184,14 +172,6 @@ def test_extremes__are_better_than_constants() -> None:
     assert (least[0] <= least[1] + 1e-9).all()
 
 
-def test_refine__golden_and_never_worse() -> None:
-    commands, harm = refine(paper(), steady(), budget=300)
-    assert harm.tolist() == [5.600547589835766, 27.88218872437303, 0.0, 0.0, 0.0, 21.763164041835232]
-    before = paper().values(Profiles.of_steps(steady()[:, :, np.newaxis], paper().last_step))["first"]
-    assert (harm <= before).all() and (steady() == -4.0).all()
-    assert (refine(paper(), commands, budget=1)[1] <= harm).all()
-
-
 def test_profiles__compact_short_and_joined() -> None:
     profile = compact(np.array([2, 2, 5, 9, 9]), np.array([[-1.0], [3.0], [-1.0], [-2.0], [4.0]]))
     assert profile.ends.tolist() == [[5, 9]] and profile.commands_mps2[0, :, 0].tolist() == [-1.0, -2.0]
@@ -248,9 +228,6 @@ def test_search__names_the_worlds_that_cannot_be_simulated(monkeypatch) -> None:
     monkeypatch.setattr(here + "search.search_world", lambda world, *given: None)
     with refused("world 4: no profile could be simulated", PhysicsError):
         search_profiles(paper(), [grid(paper())], budget=50)
-    monkeypatch.setattr(here + "search.improve", lambda *given: (np.inf, 0))
-    with refused("world 4: the given commands cannot be simulated", PhysicsError):
-        refine(paper(), steady(), budget=5)
     monkeypatch.setattr(here + "pricing.follow_worlds", lambda *given: given[-1].__setitem__(4, True))
     with refused("world 4: its profile could not be simulated", PhysicsError):
         paper().follow(paper().coasting())
