@@ -64,7 +64,7 @@ class Limited(Wrapper):  # type: ignore[misc]
 def train(seconds: float, seed: int) -> tuple[CAPQL, float, int]:
     random.seed(seed)
     torch.manual_seed(seed)
-    env = Limited(mo_gymnasium.make("EthBrakeMO-v1", scenario=SCENARIO, reward="harm"), seconds)
+    env = Limited(mo_gymnasium.make("EthBrakeMO-v1", scenario=SCENARIO, reward="first-impact-harm"), seconds)
     env.reset(seed=seed)
     env.action_space.seed(seed)
     start, agent = time.process_time(), CAPQL(env, seed=seed, log=False)
