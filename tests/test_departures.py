@@ -23,7 +23,7 @@ from ethbrake_marl.evaluation.evaluate import evaluate_teams
 from ethbrake_marl.evaluation.measure_registry import MEASURES
 from ethbrake_marl.motion.layout import BRAKE_RATE, GAP, LATENCY, SPEED
 from ethbrake_marl.worlds.channel import CHANNEL_KEYS
-from ethbrake_marl.worlds.physics import register_physics
+from ethbrake_marl.worlds.physics import PHYSICS, register_physics
 from tests import reach
 from tests.refused import refused
 
@@ -143,6 +143,33 @@ def test_features__that_predict_are_refused_at_the_door(icy: eb.Scenario, group:
     )
     with refused("does not cover Ice, by which world 0 departs from the plain game; departures that it covers: back"):
         eb.parallel_env(icy, observation=[group], reward="total-harm").reset(seed=7)
+
+
+@pytest.mark.parametrize(
+    "name", ["front_1.stopping_margin", "rear_2.fitting_deceleration", "obstacle.stopping_margin", "obstacle", "rear_1"]
+)
+def test_features__that_assume_exact_braking_are_refused(icy: eb.Scenario, name: str) -> None:
+    env = eb.parallel_env(icy, observation=["own", name], reward="total-harm")
+    with refused("', which an observation may leave out, does not cover Ice, by which world 0 departs"):
+        env.reset(seed=7)
+    policy = eb.policy_agent(lambda seen: seen[:, 0] * 0.0, name="mine", observation=["own.speed", name])
+    with refused("does not cover Ice, by which world 0 departs"):
+        eb.evaluate(icy, {"mine": policy}, episodes=2, harm_count="total")
+
+
+def test_features__that_assume_exact_braking_cover_what_brakes_exactly() -> None:
+    register_physics("same", Exact())
+    for physics in ("same", *(name for name in ("paper-map",) if name in PHYSICS)):
+        seen, _ = eb.parallel_env(PAPER.replace(physics=physics), reward="total-harm").reset(seed=7)
+        assert (seen["vehicle_2"] == eb.parallel_env(PAPER).reset(seed=7)[0]["vehicle_2"]).all()
+    eb.parallel_env("realistic-truck-buildup").reset(seed=7)
+    eb.parallel_env("paper-random-obstacle").reset(seed=7)
+
+
+@pytest.mark.parametrize("name", [name for name in ("ttc_s", "drac_mps2") if name in MEASURES])
+def test_measures__that_assume_exact_motion_are_refused(icy: eb.Scenario, name: str) -> None:
+    with refused("does not cover Ice, by which world 0 departs from the plain game"):
+        eb.evaluate(icy, "full_brake", episodes=2, measures=name, harm_count="total")
 
 
 def test_functions__that_predict_worlds_are_refused() -> None:

@@ -60,7 +60,7 @@ class Convergence:
 
 def driven(agent: str, worlds: int, changes: Mapping[str, Any]) -> eb.State:
     """Ends of the first worlds of the list under a changed scenario, with an agent as Vehicle 2."""
-    scenario, game = eb.open_game(eb.load_scenario(SCENARIO).replace(**changes), reward="harm")
+    scenario, game = eb.open_game(eb.load_scenario(SCENARIO).replace(**changes), reward="first-impact-harm")
     return eb.play_to_end(game, scenario.sample(worlds, SEED), eb.Team.of({"vehicle_2": eb.make_agent(agent)}, agent))
 
 

@@ -40,6 +40,7 @@ OBSTACLE = "obstacle"  # an obstacle stands ahead of Vehicle 1
 BACKWARD = "backward"  # a vehicle moves backward
 MAP = "map"  # impacts happen only at decisions
 SHOWN = frozenset({BUILD_UP, OBSTACLE, BACKWARD})  # departures that the arrays of every state show
+BRAKES_EXACTLY = SHOWN | {MAP}  # departures in which commands and speeds say how a vehicle moves without contact
 
 # Rows of `car` that every feature takes into account, in the order in which digests hash them. Any other row departs
 # where it is not 0; but SCRIPTED belongs to the game, not to its worlds.

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.episode.departures import BRAKES_EXACTLY
 from ethbrake_marl.episode.features import (
     FEATURES,
     GROUPS,
@@ -26,7 +27,7 @@ from ethbrake_marl.episode.features import (
 )
 from ethbrake_marl.episode.functions import call_function, check_finite_values
 from ethbrake_marl.episode.reach import clock_of_reach, row_within_reach, within_reach
-from ethbrake_marl.episode.state import TIME, State
+from ethbrake_marl.episode.state import TIME, State, require
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacity
 from ethbrake_marl.motion.layout import (
@@ -55,6 +56,7 @@ ROLE_AHEAD, ROLE_BEHIND = range(len(ROLE))
 (
     OBSTACLE_KNOWN, OBSTACLE_GAP, OBSTACLE_HIT, OBSTACLE_STOPPING_MARGIN, OBSTACLE_FITTING_DECELERATION,
 ) = range(len(OBSTACLE_FEATURES))  # fmt: skip
+ASSUME_BRAKES = (".stopping_margin", ".fitting_deceleration")  # ends of the names of features
 N_OWN, N_NEIGHBOUR, N_ROLE, N_OBSTACLE = len(OWN), len(NEIGHBOUR), len(ROLE), len(OBSTACLE_FEATURES)
 
 
@@ -97,8 +99,14 @@ class View:
         return View, ([*self.names],)
 
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
-        """Observations of the bodies ``observers`` (1: Vehicle 1), [n, len(observers), F]; this view has F features."""
+        """Observations of the bodies ``observers`` (1: Vehicle 1), [n, len(observers), F]; this view has F features.
+
+        Raises ``InvalidInput`` for features that assume exact braking in a physics that departs from it.
+        """
         plan = self.plan
+        for name in () if state.is_exact else self.names:
+            if name.endswith(ASSUME_BRAKES):
+                require(state, f"feature {name!r}, which an observation may leave out,", BRAKES_EXACTLY)
         observations = np.empty((state.n, len(observers), len(self.names)), np.float32)
         observe_worlds(
             state.line, state.car, clock_of_reach(state), state.know, observers, plan.offsets, plan.role, plan.obstacle,

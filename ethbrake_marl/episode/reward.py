@@ -190,9 +190,13 @@ class RewardParams(FileModel):
 REWARDS = {
     "shaped": RewardParams(harm=0.05, shaping=0.05, shaping_discount=0.99),
     "honest": RewardParams(),
-    "harm": RewardParams(harm_count=FIRST_IMPACTS),
+    "first-impact-harm": RewardParams(harm_count=FIRST_IMPACTS),
     "total-harm": RewardParams(harm_count=ALL_IMPACTS),
     "paper-reward": RewardParams(harm=0.0, harm_count=FIRST_IMPACTS, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
+}
+ENDED = {  # names of rewards that are refused -> what to write
+    "paper": "paper-reward for its four terms, or first-impact-harm for its count",
+    "harm": "first-impact-harm, total-harm or honest: a weight of the term harm alone counts the honest cost",
 }
 Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
 
@@ -202,8 +206,8 @@ def reward_params(reward: Reward) -> RewardParams:
     if isinstance(reward, RewardParams):
         return reward
     if isinstance(reward, str):
-        if reward == "paper":
-            raise UnknownName("reward 'paper' has ended; write paper-reward for its four terms, or harm for its count")
+        if reward in ENDED:
+            raise UnknownName(f"reward {reward!r} has ended; write {ENDED[reward]}")
         if reward not in REWARDS:
             raise unknown_name("reward", reward, REWARDS)
         return REWARDS[reward]

@@ -61,8 +61,9 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         scenario: a shipped name, the path or content of a YAML file, or a ``Scenario``.
         render_mode: a mode of ``metadata["render_modes"]``; None: no pictures.
         learners: names of the vehicles that learn; None: the scenario's.
-        reward: ``shaped``, ``honest`` (minus the honest cost, without scale and potential), ``harm``, ``total-harm``,
-            ``paper-reward``, a mapping of settings, or ``RewardParams``. Under ``harm`` pushing is free.
+        reward: ``shaped``, ``honest`` (minus the honest cost, without scale and potential), ``first-impact-harm``
+            (pushing is free), ``total-harm``, ``paper-reward``, a mapping of settings, or ``RewardParams``. A mapping
+            counts the honest cost unless its ``harm_count`` says otherwise.
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
         max_cycles: number of steps after which an episode is truncated (info ``cut``); None: only at the horizon.

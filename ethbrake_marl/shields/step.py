@@ -26,7 +26,9 @@ each of them.
 **Allowance.** With an allowance A > 0, a plan may cost up to max(c, B + A), which is then the bound until the end.
 
 **Assumptions.** The physics of the state is true, and all other vehicles follow the game's scripts. A script may look
-at the state, but must always decide the same in the same state. Every learner is shielded: a game has one shield.
+at the state, but must always decide the same in the same state. The state that is priced is the episode's own, with
+everything that scripts hear. The shield's agents change nothing in it: their memories, and so the plans that they could
+tell, stay outside (``fallbacks.AGENTS``). Every learner is shielded: a game has one shield.
 """
 
 from __future__ import annotations

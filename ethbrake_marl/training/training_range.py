@@ -24,7 +24,7 @@ def with_ranges(policies: Policies, training: Training) -> Policies:
 def record_ranges(policies: Policies, scenario: AnyScenario, worlds: int, seed: int) -> Policies:
     """Learners that share a policy share its range."""
     observed: dict[int, list[Observations]] = {id(policy): [] for policy in policies.values()}
-    loaded, game = open_game(scenario, reward="harm")  # not used, but defined in every physics
+    loaded, game = open_game(scenario, reward="first-impact-harm")  # not used, but defined in every physics
     driven = {body: policies[loaded.vehicle_names[body - 1]] for body in loaded.learners}
     drivers = {body: LearnedAgent(policy) for body, policy in driven.items()}
     for _, state in play(game, loaded.sample(worlds, seed), Team("policy", drivers)):

@@ -165,7 +165,7 @@ def test_torch_module__of_another_type_drives() -> None:
 
 def test_model__drives_as_in_its_own_librarys_rollout() -> None:
     model = stable.PPO("MlpPolicy", rows(4), n_steps=8, batch_size=16, seed=1).learn(64)
-    env = EthBrakeEnv(reward="harm")
+    env = EthBrakeEnv(reward="first-impact-harm")
     (seen, _), over, total = env.reset(seed=3), False, 0.0
     while not over:
         seen, reward, terminated, truncated, _ = env.step(predicted(model, seen))

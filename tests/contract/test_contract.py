@@ -209,7 +209,7 @@ def test_clone__in_mid_episode_goes_on_alike_and_apart(name: str, clone: Any) ->
 
 @pytest.mark.parametrize(
     ("scenario", "reward"),
-    [(PAPER, "paper-reward"), (FIVE, "harm"), (line(2).with_learners(["vehicle_1"]), "total-harm")],
+    [(PAPER, "paper-reward"), (FIVE, "first-impact-harm"), (line(2).with_learners(["vehicle_1"]), "total-harm")],
     ids=lambda value: value if isinstance(value, str) else value.name,
 )
 def test_interfaces__agree_on_every_episode(scenario: Scenario, reward: str) -> None:

@@ -115,7 +115,7 @@ def test_terminal__is_paid_once_at_a_safe_end(
         assert bool(step.safe_end[0]) == (k == when)
 
 
-@pytest.mark.parametrize(("reward", "count"), [("harm", "first"), ("total-harm", "total")])
+@pytest.mark.parametrize(("reward", "count"), [("first-impact-harm", "first"), ("total-harm", "total")])
 def test_cost__of_all_steps_is_the_harm_that_the_reward_counts(reward: str, count: str) -> None:
     _, game = open_game("paper-random-obstacle", reward=reward)
     state, cost = game.reset(game.draw(20, 7, 0)), np.zeros(20)
@@ -183,14 +183,14 @@ def test_components__of_a_step_by_hand() -> None:
 
 
 def test_components__of_vehicles_add_up_to_the_reward() -> None:
-    _, game = open_game("cooperation-4-all", reward="harm", reward_vector="vehicles")
+    _, game = open_game("cooperation-4-all", reward="first-impact-harm", reward_vector="vehicles")
     state = game.reset(game.draw(30, 1, 0))
     while not state.ended.all():
         state, step = game.step(state, np.full((30, len(game.settings.learners)), -0.2))
         assert step.vector is not None and step.vector.shape == (30, 3, 3)
         assert step.vector.sum(axis=2) == near(step.reward, abs=1e-9)
     assert state.collided.any()
-    _, game = open_game("paper-random", reward="harm", reward_vector=["harm", "harm_2"])
+    _, game = open_game("paper-random", reward="first-impact-harm", reward_vector=["harm", "harm_2"])
     _, step = game.step(game.reset(game.draw(3, 1, 0)), np.zeros((3, 1)))
     assert step.vector is not None and step.vector.shape == (3, 3, 2) and [*step.terms] == ["harm"]
 
@@ -210,9 +210,9 @@ def rewards(reward: Any, scenario: Any = "paper-random", n: int = 40) -> tuple[n
 
 def test_objective__is_the_scenarios_unless_the_reward_has_its_own() -> None:
     own = load_scenario("paper-random").replace(objective="own")
-    plain = rewards("harm")[0]
+    plain = rewards("first-impact-harm")[0]
     assert (
-        rewards("harm", own)[0].tolist()
+        rewards("first-impact-harm", own)[0].tolist()
         == rewards({"harm": 1.0, "harm_count": "first", "objective": "own"})[0].tolist()
         != plain.tolist()
     )
@@ -277,7 +277,7 @@ def test_objective__does_not_warn_where_every_impact_counts_or_an_objective_mean
 def test_named_rewards__are_those_of_the_page() -> None:
     assert {
         "shaped": RewardParams(harm=0.05, harm_count="honest", shaping=0.05, shaping_discount=0.99),
-        "harm": RewardParams(harm=1.0, harm_count="first"),
+        "first-impact-harm": RewardParams(harm=1.0, harm_count="first"),
         "total-harm": RewardParams(harm=1.0, harm_count="total"),
         "honest": RewardParams(harm=1.0, harm_count="honest"),
         "paper-reward": RewardParams(harm=0.0, harm_count="first", collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
@@ -291,6 +291,8 @@ def test_named_rewards__are_those_of_the_page() -> None:
     )
     with pytest.raises(InvalidInput, match=r"^reward 'paper' has ended; write paper-reward"):
         reward_params("paper")
+    with pytest.raises(InvalidInput, match=r"^reward 'harm' has ended; write first-impact-harm"):
+        reward_params("harm")
 
 
 def one(before: State, step: Step, after: State) -> np.ndarray:

@@ -172,7 +172,7 @@ def test_preset__is_drawn_like_the_mapping_that_it_stands_for(tmp_path: Path) ->
 
 @pytest.mark.usefixtures("mine")
 def test_objective__is_paid_by_hand_and_can_be_reported() -> None:
-    scenario, game = eb.open_game(PAPER.replace(objective="front-first"), reward="harm")
+    scenario, game = eb.open_game(PAPER.replace(objective="front-first"), reward="first-impact-harm")
     worlds = scenario.sample(6, 7)
     state, paid = game.reset(worlds), np.zeros((6, 3))
     while not state.ended.all():
@@ -234,7 +234,7 @@ def test_objective__has_a_number_as_argument() -> None:
         return np.minimum(harm.pairs, most).sum(axis=1)
 
     eb.register_objective("capped", capped, arguments=float)
-    scenario, game = eb.open_game(eb.load_scenario("paper-random").replace(objective="capped:5"), reward="harm")
+    scenario, game = eb.open_game(PAPER.replace(objective="capped:5"), reward="first-impact-harm")
     team = eb.Team.of({"vehicle_2": eb.make_agent("full_brake")}, "full_brake")
     paid, impacts = np.zeros(100), 0.0
     for step, state in eb.play(game, scenario.sample(100, seed=7), team):

@@ -37,7 +37,7 @@ def began(**settings: Any) -> EthBrakeParallelEnv:
 
 
 def test_crash__by_hand() -> None:
-    env = began(scenario=CRASH, reward="harm")
+    env = began(scenario=CRASH, reward="first-impact-harm")
     seen = [env.step({"vehicle_1": [1.0], "vehicle_2": [0.0]}) for _ in range(8)]  # from 0.5 s to the horizon at 1.3 s
     harm = [rewards["vehicle_1"] for _, rewards, *_ in seen]
     assert harm[:4] == [0.0] * 4 and sum(harm) == pytest.approx(-36.0)
@@ -67,7 +67,8 @@ def test_agents__are_given_what_their_own_vehicle_observes(agents: str) -> None:
 
 
 def test_vector_rewards__are_the_harm_that_each_vehicle_bears() -> None:
-    env, scalar = (began(scenario=CRASH, reward="harm", **more) for more in ({"reward_vector": "vehicles"}, {}))
+    vector, reward = {"reward_vector": "vehicles"}, "first-impact-harm"
+    env, scalar = (began(scenario=CRASH, reward=reward, **more) for more in (vector, {}))
     paid = []
     for _ in range(8):
         rewards, numbers = env.step({"vehicle_2": [0.0]})[1], scalar.step({"vehicle_2": [0.0]})[1]

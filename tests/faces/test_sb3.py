@@ -18,7 +18,7 @@ def played(env: EthBrakeVecEnv, steps: int, action: float = -0.3) -> list[Any]:
 
 @pytest.mark.parametrize("horizon_is_end", [True, False])
 def test_last_infos__by_hand(horizon_is_end: bool) -> None:
-    env = make_sb3_vec_env(CRASH, 2, seed=1, reward="harm", horizon_is_end=horizon_is_end)
+    env = make_sb3_vec_env(CRASH, 2, seed=1, reward="first-impact-harm", horizon_is_end=horizon_is_end)
     env.reset()
     *turns, (observation, _, done, infos) = played(env, 8, 0.0)  # to the horizon at 1.3 s, with an impact at 1 s
     assert all(not each.any() and info == [{}, {}] for _, _, each, info in turns) and done.all()

@@ -34,7 +34,7 @@ REWARDS: dict[str, Any] = {
 }
 
 
-def played(name: str, reward: Any = "harm") -> tuple[str, dict[str, np.ndarray]]:
+def played(name: str, reward: Any = "first-impact-harm") -> tuple[str, dict[str, np.ndarray]]:
     _, game = open_game(name, reward=reward)
     state, rng, sha256 = game.reset(load_scenario(name).sample(N, 7)), np.random.default_rng(7), hashlib.sha256()
     sums = np.zeros((N, state.vehicles))
@@ -52,7 +52,7 @@ def played(name: str, reward: Any = "harm") -> tuple[str, dict[str, np.ndarray]]
 @cache
 def cases() -> dict[str, tuple[str, Any]]:
     return {
-        **{name: (name, "harm") for name in SHIPPED if load_scenario(name).learners},
+        **{name: (name, "first-impact-harm") for name in SHIPPED if load_scenario(name).learners},
         **{f"paper-random-obstacle, {name}": ("paper-random-obstacle", reward) for name, reward in REWARDS.items()},
     }
 

@@ -120,7 +120,7 @@ def test_policies_propose_what_the_caller_leaves_out() -> None:
     env.reset(seed=7)
     infos = env.step({"vehicle_3": [0.5]})[4]
     assert [infos[f"vehicle_{i}"]["shield_proposed_action"] for i in (1, 2, 3)] == [0.0, 0.0, 0.5]
-    gym = shield(EthBrakeEnv("paper-random", reward="harm"), load_shipped("ppo"))
+    gym = shield(EthBrakeEnv("paper-random", reward="first-impact-harm"), load_shipped("ppo"))
     first = gym.reset(seed=7)[1]["shield_bound_harm"]
     over = False
     while not over:
@@ -132,7 +132,7 @@ def test_policies_propose_what_the_caller_leaves_out() -> None:
 
 def test_the_bound_holds_where_the_next_step_begins_the_next_episode() -> None:
     """Gymnasium's default: the step after an episode's last one reports the bound of the next one."""
-    env = shield(EthBrakeVectorEnv(8, "paper-random", reward="harm"))
+    env = shield(EthBrakeVectorEnv(8, "paper-random", reward="first-impact-harm"))
     first, over, episodes = env.reset(seed=1)[1]["shield_bound_harm"].copy(), np.zeros(8, bool), 0
     for _ in range(120):
         *_, ended, cut, infos = env.step(np.ones((8, 1)))
@@ -144,7 +144,7 @@ def test_the_bound_holds_where_the_next_step_begins_the_next_episode() -> None:
 
 
 def test_mode_episode() -> None:
-    env = shield(EthBrakeEnv("paper-random", reward="harm"), "full_brake", "episode", bound="pairwise")
+    env = shield(EthBrakeEnv("paper-random", reward="first-impact-harm"), "full_brake", "episode", bound="pairwise")
     env.reset(seed=7)
     info = env.step([0.0])[4]
     names = {"chosen_policy", "policy_harm", "bound_harm", "proposed_action", "applied_action", "intervened"}
@@ -171,7 +171,7 @@ def test_teams_and_names() -> None:
 def test_the_count__is_that_of_the_reward_unless_it_is_given() -> None:
     for env, count in (
         (EthBrakeEnv("paper-random"), HONEST),
-        (EthBrakeEnv("paper-random", reward="harm"), FIRST_IMPACTS),
+        (EthBrakeEnv("paper-random", reward="first-impact-harm"), FIRST_IMPACTS),
     ):
         assert shield(env).unwrapped.game.shield.harm_count == count
         assert shield(env, "ppo", "episode").unwrapped.game.shield.harm_count == count

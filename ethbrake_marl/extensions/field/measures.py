@@ -6,8 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ethbrake_marl.episode.departures import BRAKES_EXACTLY
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.evaluation.measures import MeasureValue, Statistic
 from ethbrake_marl.motion.layout import Floats
@@ -49,6 +50,7 @@ def ttc_s(game: Game, alert: State) -> Closest:
     s if no gap closes. Without a number: of the line; with the number of a vehicle: of this vehicle and the one behind
     it; critical: whether that of the line is below 1.5 s.
     """
+    require(alert, "time to collision", BRAKES_EXACTLY)
     return Closest(0, 1.0 / CRITICAL_S, lambda rate: 1.0 / np.maximum(rate, 1.0 / FREE_S), alert)
 
 
@@ -57,6 +59,7 @@ def drac_mps2(game: Game, alert: State) -> Closest:
     decisions before a pair's first impact; large where a collision follows. Without a number: of the line; with the
     number of a vehicle: of the one behind it; critical: whether that of the line is above 3.4 m/s2.
     """
+    require(alert, "required deceleration", BRAKES_EXACTLY)
     return Closest(1, CRITICAL_MPS2, np.asarray, alert)
 
 

@@ -42,7 +42,7 @@ Outcomes = Mapping[str, Outcome]  # strategy -> outcome
 
 @lru_cache(16)
 def open_reading(reading: Reading, episodes: int) -> tuple[Scenario, Game, State]:
-    scenario, game = open_game(reading.scenario(), reward="harm")
+    scenario, game = open_game(reading.scenario(), reward="first-impact-harm")
     return scenario, game, scenario.sample(episodes, SEED)
 
 

@@ -82,7 +82,7 @@ class BestHarm(Predicting):
     def joint_plan(self, alert: State) -> SearchMemory:
         """[n, T, L] m/s2."""
         check_known_commands(self.scenario, self.scenario.learners)
-        game, objective = game_of(self.scenario, {}, "harm")[1], self.scenario.objective
+        game, objective = game_of(self.scenario, {}, "first-impact-harm")[1], self.scenario.objective
         problem = problem_of(game, alert, harm_count=self.harm_count, objective=objective)
         worlds = problem.identity.tobytes()
         if self.last_plan is None or self.last_plan[0] != worlds:
@@ -135,7 +135,8 @@ def single_learner_game(scenario: Scenario, alert: State, body: int) -> tuple[Ga
     """
     check_known_commands(scenario, [body])
     braking_learners = [learner for learner in scenario.learners if learner != body]
-    _, game = game_of(scenario.with_learners([scenario.vehicle_names[body - 1]]), {}, "harm")  # the reward is not used
+    alone = scenario.with_learners([scenario.vehicle_names[body - 1]])
+    _, game = game_of(alone, {}, "first-impact-harm")  # the reward is not used
     return game, with_braking(alert, braking_learners)
 
 

@@ -43,7 +43,7 @@ def test_play_on__is_the_episode_and_its_discounted_reward() -> None:
 
 def test_branch__ends_where_nothing_can_change_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
     """A policy that presses on against a standing line: the same returns, with fewer decisions."""
-    game, state = begun(30, ["vehicle_2"], reward="harm")
+    game, state = begun(30, ["vehicle_2"], reward="first-impact-harm")
 
     def pressed() -> tuple[np.ndarray, int]:
         asked = []

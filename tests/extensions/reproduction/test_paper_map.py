@@ -61,7 +61,7 @@ def test_game__has_the_figures_of_version_0_5(step_s: float, agent: str, harm: f
 def test_game__world_does_not_depend_on_the_others_and_its_end_stays() -> None:
     alert = MAPPED.sample(3, 7)
     alert.car[1, LATENCY, 2] = 0.31
-    _, game = eb.open_game(MAPPED, reward="harm")
+    _, game = eb.open_game(MAPPED, reward="first-impact-harm")
     states = [game.reset(alert), *(game.reset(alert.take([k])) for k in range(3))]
     for step in range(90):
         action = -0.5 + 0.3 * np.sin(step)
@@ -110,7 +110,7 @@ def test_k_energy__of_each_pair_in_exact_physics() -> None:
 
 
 def test_observation__is_the_state_of_the_paper() -> None:
-    env = eb.EthBrakeEnv("paper-random-map", reward="harm")
+    env = eb.EthBrakeEnv("paper-random-map", reward="first-impact-harm")
     observation, _ = env.reset(seed=7)
     assert observation.shape == (8,)
     assert env.unwrapped.game.views[2].names == (
@@ -181,7 +181,7 @@ def test_record__is_refused() -> None:
 
 def test_watch__is_refused() -> None:
     with refused("a picture does not cover map"):
-        eb.EthBrakeEnv(MAPPED, render_mode="ansi", reward="harm").reset(seed=1)
+        eb.EthBrakeEnv(MAPPED, render_mode="ansi", reward="first-impact-harm").reset(seed=1)
 
 
 def test_mixture__has_one_physics() -> None:
