@@ -6,11 +6,10 @@ version 1.27 on). A public name is imported when it is first used, so torch and 
 
 from __future__ import annotations
 
-import sys
+from ethbrake_marl.program import is_program  # first: the other imports take long, and Ctrl-C may come
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ethbrake_marl.lazy_imports import names_behind
@@ -140,5 +139,5 @@ def __dir__() -> list[str]:
 
 
 # The command line registers the environments only when a command runs: importing Gymnasium would slow down --help.
-if Path(sys.argv[0] if sys.argv else "").name != "ethbrake":
+if not is_program():
     register_environments()

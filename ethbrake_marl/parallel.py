@@ -14,10 +14,9 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from functools import cache
 from itertools import islice
-from multiprocessing import resource_tracker
 from typing import Any
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, check_whole_number, naming_extras
@@ -94,19 +93,12 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
         parallel = Parallel(jobs, batch_size=1, return_as="generator" if streams else "list")
     first = [_pickle_call(call) for call in PREPARATIONS.values()]
     work = (delayed(_answer)(os.getpid(), share, first, _pickle_call(call)) for call in calls)
-    is_blocked = streams and hasattr(signal, "pthread_sigmask")
     batches = [work] if streams else iter(lambda: list(islice(work, PER_PROCESS * jobs)), [])
     for batch in batches:
         results: Any = ()
         try:
-            if is_blocked:  # processes that start inherit the block, until they ignore Ctrl-C
-                resource_tracker.ensure_running()  # it starts with the signal unblocked, and would unblock it here, too
-                signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
+            with _interrupts_ignored() if streams else nullcontext():  # also by the processes that start
                 results = parallel(batch)
-            finally:
-                if is_blocked:
-                    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             for result in results:  # noqa: UP028  # `yield from` would close `results` outside the clause below
                 yield result
         except BrokenProcessPool:
@@ -114,24 +106,21 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
                 "a worker process was killed, perhaps because memory ran out; use fewer processes at once (--jobs)"
             ) from None
         finally:
-            with warnings.catch_warnings(action="ignore"), _silent_joblib():  # warnings about calls that are cancelled
+            with warnings.catch_warnings(action="ignore"):  # warnings about calls that are cancelled
                 getattr(results, "close", list)()
 
 
 @contextmanager
-def _silent_joblib() -> Iterator[None]:
-    """Context in which an exception in joblib's thread prints nothing: it may fill a queue that is closed."""
-    before = threading.excepthook
-
-    def tell(arguments: threading.ExceptHookArgs) -> None:
-        if arguments.thread is None or arguments.thread.name != "ExecutorManagerThread":
-            before(arguments)
-
-    threading.excepthook = tell
+def _interrupts_ignored() -> Iterator[None]:
+    """Context in which Ctrl-C has no effect. Processes that start here ignore it until they end."""
+    if threading.current_thread() is not threading.main_thread():  # Python lets only this one choose
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
-        threading.excepthook = before
+        signal.signal(signal.SIGINT, before)
 
 
 def _pickle_call(call: Call) -> bytes:
@@ -166,8 +155,6 @@ def _become_worker() -> None:
     """Ignore Ctrl-C (calls may still listen to it), and exit when the parent ends."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        if hasattr(signal, "pthread_sigmask"):
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def watch(parent: int) -> None:
         while os.getppid() == parent:

@@ -1,6 +1,10 @@
 """Independent calls: one at a time, in processes, and where joblib's configuration says."""
 
 import os
+import signal
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -47,6 +51,26 @@ def test_chosen_threads__refuses_a_bad_variable(text: str, monkeypatch: pytest.M
 def test_chosen_threads__refuses_a_bad_number(threads: object) -> None:
     with pytest.raises(InvalidInput, match=r"^threads = .*: must be a whole number in 1..1024$"):
         parallel.chosen_threads(threads)
+
+
+def test_processes__ignore_ctrl_c_from_their_start_and_this_one_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loky = pytest.importorskip("joblib").externals.loky
+    usual = signal.getsignal(signal.SIGINT)
+    (tmp_path / "sitecustomize.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\n")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    loky.get_reusable_executor().shutdown(kill_workers=True)
+    assert [*run_each([(signal.getsignal, signal.SIGINT)] * 3, 2)] == [signal.SIG_IGN] * 3
+    assert signal.getsignal(signal.SIGINT) == usual
+
+
+def test_processes__that_a_thread_starts_ignore_ctrl_c() -> None:
+    """Python changes signals in the main thread only."""
+    pytest.importorskip("joblib").externals.loky.get_reusable_executor().shutdown(kill_workers=True)
+    calls = [(signal.getsignal, signal.SIGINT)] * 3
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(lambda: [*run_each(calls, 2)]).result() == [signal.SIG_IGN] * 3
 
 
 @pytest.mark.parametrize(("cores", "jobs", "processes", "share"), [(5, 2, 2, 2), (3, 8, 3, 1), (2, 2, 2, 1)])

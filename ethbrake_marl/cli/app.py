@@ -8,9 +8,7 @@ import os
 import re
 import signal
 import sys
-import threading
 import warnings
-from _thread import interrupt_main
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from functools import cache
@@ -24,8 +22,9 @@ from typer.main import get_command, get_group
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
-from ethbrake_marl.cli.command import INTERRUPTED, UNWRITTEN, Out, example, refuse
+from ethbrake_marl.cli.command import UNWRITTEN, Out, example, refuse
 from ethbrake_marl.errors import EthBrakeError, describe_error, naming_extras
+from ethbrake_marl.program import INTERRUPTED, raise_on_interrupt
 from ethbrake_marl.registry import DISTRIBUTION, Registry, giver, points
 
 app = typer.Typer(
@@ -35,9 +34,8 @@ app = typer.Typer(
     help="Ethical emergency braking: train, shield and evaluate agents. Every command has a --help with an example.",
     epilog=example("run", "evaluate --agents full_brake,e_v2x_bm --episodes 1000"),
 )
-_IGNORED = threading.Event()  # a Ctrl-C has been ignored and is repeated
 _COMPLETE = "_ETHBRAKE_COMPLETE"  # variable with which a shell asks to complete a command line
-_NAMES = "Names that can be used in --set, recipes and scenarios: ethbrake scenario parts"
+_NAMES = "Names that can be used in --set, recipes and scenarios: ethbrake scenario list"
 for name, command, usage in (
     ("run", run.experiment_command, "run --steps 200000 --seed 1"),
     ("train", train.train_command, "train --recipe sac --output runs/sac"),
@@ -55,33 +53,41 @@ def _show_version(wants_version: bool) -> None:
         raise typer.Exit
 
 
+def _load_files(context: typer.Context, files: list[str] | None) -> None:
+    from ethbrake_marl.files.python_file import load_file
+
+    if not context.resilient_parsing:
+        with redirect_stdout(sys.stderr):
+            for file in files or ():
+                load_file(file)
+
+
 @app.callback()
 def _about(
     version: Annotated[
         bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
     ] = False,
+    load: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FILE.py",
+            is_eager=True,
+            callback=_load_files,
+            help="Run a Python file that registers your own components (docs/extend.md). Can be given several times.",
+        ),
+    ] = None,
 ) -> None:
-    """Show the version."""
+    """Show the version, or load files."""
 
 
 def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy starts threads of its own: one core unless asked
     gc.set_threshold(20_000)  # Python's default of 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
     prepare_streams()
-    sys.unraisablehook = repeat_interrupt
+    raise_on_interrupt()
     status = run_command(sys.argv[1:])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command has ended
-    exec("")  # noqa: S102  # after Ctrl-C inside another `exec`, Python would end without this status
     sys.exit(status)
-
-
-def repeat_interrupt(ignored: sys.UnraisableHookArgs) -> None:
-    """Repeat a Ctrl-C that Python has ignored, because it arrived in a function that LLVM called."""
-    if ignored.exc_type is KeyboardInterrupt:
-        _IGNORED.set()
-        threading.Timer(0.05, interrupt_main).start()  # not now: this function would lose it, too
-    else:
-        sys.__unraisablehook__(ignored)
 
 
 def run_command(arguments: Sequence[str]) -> int:
@@ -113,11 +119,10 @@ def run_command(arguments: Sequence[str]) -> int:
     except MemoryError as error:
         return refuse(f"not enough memory{f' ({error})' if str(error) else ''}; use fewer worlds at once")
     except KeyboardInterrupt:
-        return _interrupted()
+        Out().note("interrupted; repeat the command")
+        return INTERRUPTED
     except Exception:
-        if not _IGNORED.is_set():
-            raise
-        return _interrupted()  # LLVM's callers miss what the interrupted function would have done
+        raise
     except BaseException as error:  # GeneratorExit and similar, which this package never raises
         return refuse(f"your own code ended the process: {describe_error(error)}")
     return status
@@ -139,11 +144,6 @@ def _status_of(arguments: Sequence[str]) -> int:
             Out().note(stop.code)
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     return 0
-
-
-def _interrupted() -> int:
-    Out().note("interrupted; repeat the command")
-    return INTERRUPTED
 
 
 def prepare_streams() -> None:
@@ -216,7 +216,7 @@ class Installed(TyperCommand):
     def command(self) -> Any:
         command = COMMANDS[self.entry]
         command.name = self.name
-        return with_load(with_installed(command, self.entry))
+        return with_load(with_installed(command, self.entry), load_option(whole_command()))
 
     def make_context(self, *arguments: Any, **settings: Any) -> Any:
         return self.command().make_context(*arguments, **settings)
@@ -252,50 +252,21 @@ def _build_commands(*registered: object) -> Any:
         group = get_group(typer.Typer(name=name, help="Commands of installed packages.", add_completion=False))
         program.commands[name] = with_installed(group, name)
     program.commands["doctor"] = program.commands.pop("doctor")  # the last one of the help
-    return with_load(program)
+    load = load_option(program)
+    load.expose_value = False
+    return with_load(program, load)
 
 
-def with_load(command: Any) -> Any:
-    """The command, or each of a group that is not ``Installed``, with the option ``--load FILE.py``."""
+def load_option(program: Any) -> Any:
+    """The option ``--load``, which all commands share."""
+    return next(option for option in program.params if option.name == "load")
+
+
+def with_load(command: Any, load: Any) -> Any:
+    """The command, or each of a group that is not ``Installed``, with the option ``load``."""
     if hasattr(command, "commands"):
         for inside in command.commands.values():
-            with_load(inside)
-    elif not isinstance(command, Installed) and LOAD not in command.params:
-        command.params.append(LOAD)
+            with_load(inside, load)
+    elif not isinstance(command, Installed) and all(option.name != load.name for option in command.params):
+        command.params.append(load)
     return command
-
-
-def _load_files(context: typer.Context, files: list[str] | None) -> None:
-    from ethbrake_marl.files.python_file import load_file
-
-    if not context.resilient_parsing:
-        with redirect_stdout(sys.stderr):
-            for file in files or ():
-                load_file(file)
-
-
-LoadOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--load",
-        metavar="FILE.py",
-        is_eager=True,
-        callback=_load_files,
-        help="Run a Python file that registers components of your own (docs/extend.md). Can be given several times.",
-    ),
-]
-
-
-def _only_load(load: LoadOption = None) -> None:
-    """Signature from which Typer makes the option ``--load`` of every command."""
-
-
-def _option_of(function: Callable[..., Any]) -> Any:
-    command = typer.Typer(add_completion=False)
-    command.command()(function)
-    (option,) = [option for option in get_command(command).params if option.name == "load"]
-    option.expose_value = False
-    return option
-
-
-LOAD = _option_of(_only_load)

@@ -6,7 +6,6 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
-from importlib import import_module
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, NoReturn, Self, TextIO
@@ -17,12 +16,12 @@ from rich.segment import Segment
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, one_line, plain_text
 from ethbrake_marl.faces.registration import register_environments
+from ethbrake_marl.program import INTERRUPTED
 from ethbrake_marl.progress import Progress, ShownProgress
 
 # special characters allowed in results; the no-break space is used between a number and its unit
 _UNESCAPED = "\n\t\N{NO-BREAK SPACE}"
 
-INTERRUPTED = 130  # exit status after Ctrl-C: 128 + SIGINT, as shells expect
 UNWRITTEN = 3  # exit status if output cannot be written
 
 ScenarioOption = Annotated[
@@ -54,18 +53,6 @@ JobsOption = Annotated[
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on stdout as JSON.")]
-
-
-def schema_option(module: str, function: str, kind: str) -> Any:
-    """``function`` in ``module`` returns the schema; the module is imported only when the option is used."""
-
-    def show_schema(wants_schema: bool) -> None:
-        if wants_schema:
-            Out().print_json(getattr(import_module(module), function)())
-            raise typer.Exit
-
-    text = f"Print the JSON Schema of {kind} files, and exit."
-    return Annotated[bool, typer.Option("--schema", is_eager=True, callback=show_schema, help=text)]
 
 
 def example(*lines: str) -> str:

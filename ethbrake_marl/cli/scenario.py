@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,13 +10,14 @@ import typer
 
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SeedOption, SettingsOption, example
 from ethbrake_marl.cli.pages import page_function
-from ethbrake_marl.files.sheet import Sheet
+from ethbrake_marl.files.sheet import Column, Sheet
 
 if TYPE_CHECKING:
     from ethbrake_marl.cli.trial import Trial
     from ethbrake_marl.worlds.scenario import Scenario
 
 TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # worlds that `scenario sample` draws for a table and for a picture
+SHOWN_KINDS = 6  # vehicle types, recordings and the like that `scenario validate` names
 
 NameArgument = Annotated[
     str, typer.Argument(metavar="NAME|PATH", help="Name of a shipped or registered scenario, or path of a YAML file.")
@@ -32,16 +31,49 @@ scenario_group = typer.Typer(
 
 @scenario_group.command("list", epilog=example("scenario list"))
 def scenario_list(as_json: JsonOption = False) -> None:
-    """List the shipped and registered scenarios."""
+    """List the scenarios, and the names that files can use.
+
+    These names stand in scenarios, recipes and --set: features of observations, V2X presets, objectives, terms of
+    rewards, counts of harm, measures beside the usual ones, training algorithms and recipes.
+    """
     from ethbrake_marl.worlds.catalogue import list_scenarios
 
     with Out(as_json=as_json) as out:
-        entries = list_scenarios()
+        entries, parts = list_scenarios(), _parts()
         width = max(len(entry.name) for entry in entries)
+        scenarios = [{"name": e.name, "title": e.title, "path": str(e.path), "origin": e.origin} for e in entries]
+        rows = [(what, ", ".join(names)) for what, names in parts.items()]
         out.result(
-            [{"name": e.name, "title": e.title, "path": str(e.path), "origin": e.origin} for e in entries],
+            {"scenarios": scenarios, "parts": parts},
             *(f"{e.name:{width}}  {e.title}{'' if e.shipped else f'  (from {e.origin})'}" for e in entries),
+            "",
+            Sheet("", ("Names of", "in scenarios, recipes and --set"), rows, gap=2),
         )
+
+
+def _parts() -> dict[str, list[str]]:
+    from ethbrake_marl.episode.counts import COUNTS
+    from ethbrake_marl.episode.features import FEATURES, GROUPS, WHOLE_GROUPS
+    from ethbrake_marl.episode.objectives import OBJECTIVES
+    from ethbrake_marl.episode.terms import BUILT_IN, TERMS
+    from ethbrake_marl.evaluation.measure_registry import MEASURES
+    from ethbrake_marl.evaluation.measures import DEFAULT
+    from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
+    from ethbrake_marl.worlds.channel import PRESETS
+
+    features = FEATURES.usable().items()
+    usual = {measure.name for measure in DEFAULT}
+    feature_names = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
+    return {
+        "Observation": [*WHOLE_GROUPS, "front_K", "rear_K", *GROUPS, *feature_names],
+        "V2X presets": [*PRESETS],
+        "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
+        "Terms": [*BUILT_IN, *TERMS],
+        "Counts of harm": [*COUNTS],
+        "Measures": [name for name in MEASURES if name not in usual],
+        "Algorithms": [*ALGORITHMS],
+        "Recipes": [*usable_recipes()],
+    }
 
 
 @scenario_group.command("show", epilog=example("scenario show paper-random"))
@@ -70,15 +102,27 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
     with Out(as_json=as_json) as out:
         scenario = load_scenario(path)
         trial = try_scenario(scenario)
-        out.result(_trial_content(scenario, trial), *_trial_lines(scenario, trial))
+        content = _trial_content(scenario, trial)
+        learners = ", ".join(trial.known) or "none"
+        title = f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; tried in {trial.n} worlds"
+        out.result(content, title, _facts(scenario, trial, content), "", _quantities(content), "", _means(trial))
 
 
 def _trial_content(scenario: Scenario, trial: Trial) -> dict[str, Any]:
+    import numpy as np
+
+    from ethbrake_marl.worlds.describe import kinds_of, quantities_of
+
+    quantities = {
+        name: dict(zip(("least", "median", "largest"), np.nanquantile(column, (0.0, 0.5, 1.0)).tolist(), strict=True))
+        for name, column in quantities_of(trial.drawn.worlds, trial.drawn.friction).items()
+        if not np.isnan(column).all()
+    }
     return {
         "name": scenario.name,
         "vehicles": scenario.vehicles,
         "learners": [scenario.vehicle_names[body - 1] for body in scenario.learners],
-        "worlds": trial.drawn.worlds.n,
+        "worlds": trial.n,
         "rejected": trial.drawn.rejected,
         "early_impacts": trial.early,
         "moving_at_horizon": trial.moving,
@@ -86,76 +130,51 @@ def _trial_content(scenario: Scenario, trial: Trial) -> dict[str, Any]:
         "known": trial.known,
         "harm": trial.harm,
         "refused_by": trial.refused,
-        "quantities": _ranges(trial),
-        "kinds": {name: dict(Counter(column.tolist())) for name, column in _kinds(trial).items()},
+        "quantities": quantities,
+        "kinds": {name: dict(Counter(column.tolist())) for name, column in kinds_of(trial.drawn).items()},
     }
 
 
-def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
+def _facts(scenario: Scenario, trial: Trial, content: dict[str, Any]) -> Sheet:
+    rejected = trial.drawn.rejected
+    facts = {
+        "Early impacts": f"{rejected} of {rejected + trial.n} draws rejected, {trial.early} of {trial.n} worlds kept",
+        f"Some vehicle moves at the horizon ({scenario.horizon_s:g} s)": f"in {trial.moving} of {trial.n} worlds",
+    }
+    if trial.late and scenario.alert_s is None:
+        facts["Vehicle 1, whose braking is the alert"] = f"has a latency in {trial.late} of {trial.n} worlds"
+    for learner, shares in trial.known.items():
+        known = ", ".join(f"{name} in {100.0 * share:.1f} %" for name, share in shares.items())
+        facts[f"{learner} knows when it can first act"] = f"{known} of the worlds"
+    for name, kinds in content["kinds"].items():
+        common = Counter(kinds).most_common(SHOWN_KINDS)
+        facts[name] = ", ".join(f"{kind or 'no type'} {count}" for kind, count in common)
+        facts[name] += " ..." if len(kinds) > SHOWN_KINDS else ""
+    for spec, why in trial.refused.items():
+        facts[f"{spec} cannot drive here"] = why
+    note = "Later impacts are not counted unless you raise horizon_s." if trial.moving else ""
+    return Sheet("", ("Trial", "Result"), [*facts.items()], note, gap=2)
+
+
+def _quantities(content: dict[str, Any]) -> Sheet:
+    """A quantity that is the same in all worlds has a median only."""
+    columns = [Column("Quantity", text=True), *(Column(each, digits=3) for each in ("Median", "Least", "Largest"))]
+    rows = [(name, each["median"], each["least"], each["largest"]) for name, each in content["quantities"].items()]
+    return Sheet("", columns, [row if row[2] != row[3] else row[:2] for row in rows], gap=2)
+
+
+def _means(trial: Trial) -> Sheet | str:
+    """Harm by what drives the learners, if there are any."""
     from ethbrake_marl.episode.counts import HarmCount
 
-    n, ranges = trial.drawn.worlds.n, _ranges(trial)
-    learners = ", ".join(trial.known) or "none"
-    yield f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; tried in {n} worlds"
-    for name, column in _kinds(trial).items():
-        counts = ", ".join(f"{kind or 'no type'} {count}" for kind, count in sorted(Counter(column.tolist()).items()))
-        yield from _fold(f"{name}: {counts}", 2)
-    varying = {name: extent for name, extent in ranges.items() if extent["least"] != extent["largest"]}
-    width = max(map(len, varying), default=0)
-    if varying:
-        yield f"{'drawn':{width}} {'least':>8} {'median':>8} {'largest':>8}"
-    for name, extent in varying.items():
-        yield f"{name:{width}}" + "".join(f" {value:>8.4g}" for value in extent.values())
-    same = [f"{name} {extent['least']:g}" for name, extent in ranges.items() if name not in varying]
-    yield from _fold(f"the same in all worlds: {'; '.join(same) or 'nothing'}", 20)
-    rejected = trial.drawn.rejected
-    yield (
-        f"early impacts: {_share(rejected, rejected + n, 'draws')} rejected, {_share(trial.early, n)} kept"
-        if rejected or trial.early
-        else "early impacts: none"
-    )
-    if trial.late and scenario.alert_s is None:
-        yield f"Vehicle 1, whose braking is the alert, has a latency above 0 in {_share(trial.late, n)}"
-    yield f"at the horizon ({scenario.horizon_s:g} s) some vehicle still moves in {_share(trial.moving, n)}"
-    if trial.moving:
-        yield "  later impacts are not counted unless you raise horizon_s"
-    for learner, shares in trial.known.items():
-        knowledge = ", ".join(f"{name} in {100.0 * share:.1f} %" for name, share in shares.items())
-        yield from _fold(f"{learner} knows when it can first act: {knowledge} of the worlds", 4)
-    for what, harm in trial.harm.items():
-        means = ", ".join(f"{HarmCount.of(name).words} {mean:.2f}" for name, mean in harm.items())
-        yield from _fold(f"means, {what}: {means}", 3)
-    for spec, why in trial.refused.items():
-        yield from _fold(f"{spec} cannot drive here: {why}", 3)
     costs = [harm[trial.harm_count.name] for harm in trial.harm.values()]
-    if len(costs) > 1 and costs[0] - min(costs) <= 0.02 * costs[0]:
-        yield f"there is hardly anything to learn: nothing tried saves 2 % of full braking's {trial.harm_count.words}"
-
-
-def _ranges(trial: Trial) -> dict[str, dict[str, float]]:
-    import numpy as np
-
-    from ethbrake_marl.worlds.describe import quantities_of
-
-    return {
-        name: dict(zip(("least", "median", "largest"), np.nanquantile(column, (0.0, 0.5, 1.0)).tolist(), strict=True))
-        for name, column in quantities_of(trial.drawn.worlds, trial.drawn.friction).items()
-        if not np.isnan(column).all()
-    }
-
-
-def _kinds(trial: Trial) -> dict[str, Any]:
-    from ethbrake_marl.worlds.describe import kinds_of
-
-    return kinds_of(trial.drawn)
-
-
-def _fold(text: str, most: int) -> list[str]:
-    return textwrap.wrap(text, 80, max_lines=most, placeholder=" ...", break_on_hyphens=False)
-
-
-def _share(part: int, total: int, things: str = "worlds") -> str:
-    return f"{part:,} of {total:,} {things} ({100.0 * part / total:.1f} %)"
+    if not costs:
+        return "Nobody learns."
+    counts = [HarmCount.of(name).words.capitalize() for name in next(iter(trial.harm.values()))]
+    columns = [Column("Mean per world in m²/s²", text=True), *map(Column, counts)]
+    is_easy = len(costs) > 1 and costs[0] - min(costs) <= 0.02 * costs[0]
+    note = f"There is hardly anything to learn: nothing tried saves 2 % of full braking's {trial.harm_count.words}."
+    return Sheet("", columns, [(what, *harm.values()) for what, harm in trial.harm.items()], note * is_easy, gap=2)
 
 
 @scenario_group.command("new", epilog=example("scenario new my-scenario --based-on paper-distance"))
@@ -179,53 +198,6 @@ def scenario_new(
         out.check(file)
         out.write(file, text)
         out.note(f"written: {file}; change the file, then run: ethbrake scenario validate {file}")
-
-
-@scenario_group.command("parts", epilog=example("scenario parts"))
-def scenario_parts(as_json: JsonOption = False) -> None:
-    """List the names that scenarios, recipes and --set can use.
-
-    Lists features of observations, V2X presets, objectives, terms of rewards, measures beside the usual ones, training
-    algorithms and recipes.
-    """
-    from ethbrake_marl.episode.counts import COUNTS
-    from ethbrake_marl.episode.features import FEATURES, GROUPS, WHOLE_GROUPS
-    from ethbrake_marl.episode.objectives import OBJECTIVES
-    from ethbrake_marl.episode.terms import BUILT_IN, TERMS
-    from ethbrake_marl.evaluation.measure_registry import MEASURES
-    from ethbrake_marl.evaluation.measures import DEFAULT
-    from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
-    from ethbrake_marl.worlds.channel import PRESETS
-
-    features = FEATURES.usable().items()
-    usual = {measure.name for measure in DEFAULT}
-    feature_names = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
-    parts = {
-        "Observation": [*WHOLE_GROUPS, "front_K", "rear_K", *GROUPS, *feature_names],
-        "V2X presets": [*PRESETS],
-        "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
-        "Terms": [*BUILT_IN, *TERMS],
-        "Counts of harm": [*COUNTS],
-        "Measures": [name for name in MEASURES if name not in usual],
-        "Algorithms": [*ALGORITHMS],
-        "Recipes": [*usable_recipes()],
-    }
-    with Out(as_json=as_json) as out:
-        out.result(
-            parts, Sheet("", ("What", "Names"), [(what, ", ".join(names)) for what, names in parts.items()], gap=2)
-        )
-
-
-@scenario_group.command("schema", epilog=example("scenario schema > scenario.schema.json"))
-def scenario_schema() -> None:
-    """Print the JSON Schema of scenario files.
-
-    Editors complete and check YAML with it.
-    """
-    from ethbrake_marl.worlds.scenario_file import scenario_json_schema
-
-    with Out() as out:
-        out.print_json(scenario_json_schema())
 
 
 @scenario_group.command("sample", epilog=example("scenario sample paper-random --output worlds.png"))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SettingsOption, StepsOption, schema_option
+from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SettingsOption, StepsOption
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Column, Sheet
 
@@ -61,7 +61,6 @@ def train_command(
             help="With --resume: continue even if the run used other package versions; numbers may differ.",
         ),
     ] = False,
-    schema: schema_option("ethbrake_marl.training.recipe_file", "recipe_schema", "recipe") = False,  # type: ignore[valid-type]  # built by a function
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:

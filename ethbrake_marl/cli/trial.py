@@ -31,6 +31,10 @@ class Trial(NamedTuple):
     harm: dict[str, dict[str, float]]  # what drives the learners -> name of a count -> mean harm (m2/s2)
     refused: dict[str, str]  # agents that cannot drive here -> why
 
+    @property
+    def n(self) -> int:
+        return self.drawn.worlds.n
+
 
 def try_scenario(scenario: Scenario) -> Trial:
     """Raises the errors of scripts, which name vehicle, world and time."""

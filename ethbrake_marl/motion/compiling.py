@@ -63,8 +63,13 @@ class _Cache(NullCache):  # type: ignore[misc]
         return stored
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        if not data.library.has_dynamic_globals and " at 0x" not in repr(sig):  # addresses in this process
-            save_data(self._name(sig, data.codegen), dumps(data._reduce()))
+        if data.library.has_dynamic_globals or " at 0x" in repr(sig):  # addresses in this process
+            return
+        try:
+            content = data._reduce()
+        except RuntimeError:  # no machine code: Ctrl-C came while LLVM called Python, which then only prints it
+            raise KeyboardInterrupt from None
+        save_data(self._name(sig, data.codegen), dumps(content))
 
 
 def _compile(function: Function, **options: Any) -> Function:

@@ -112,7 +112,7 @@ class TrainingRecipe(FileModel):
         " another one; if missing, paper-random",
     )
     algorithm: str = Field(
-        description="name of the learning algorithm: ppo, sac, or another registered one (ethbrake scenario parts)"
+        description="name of the learning algorithm: ppo, sac, or another registered one (ethbrake scenario list)"
     )
     scheme: Scheme | None = Field(  # None: single for one learner, shared for several
         None, description="how several learners train together: single, shared, independent, centralised"

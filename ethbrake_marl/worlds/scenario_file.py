@@ -12,7 +12,7 @@ from ethbrake_marl.files.json_schema import FileSchema
 from ethbrake_marl.files.model import NAME_PATTERN
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import YAML_SIZE_LIMIT, flow_text, parse_yaml
-from ethbrake_marl.worlds.catalogue import load_scenario, scenario_path
+from ethbrake_marl.worlds.catalogue import load_scenario, scenario_path, shipped_folder
 from ethbrake_marl.worlds.channel import V2X
 from ethbrake_marl.worlds.channel_table import key_table, values_of
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
@@ -28,9 +28,8 @@ _HEAD = """\
 #   {{lognormal: {{median: 1.1, sigma: 0.4, low: 0.3, high: 3}}}}    truncated to [low, high]
 #   {{choice: [6, 7, 8]}}    optionally with weights: [1, 2, 1]
 # A single entry is for all vehicles, each of which draws its own value. A list has one entry per vehicle.
-# yaml-language-server: $schema=scenario.schema.json
-# To let your editor complete and check this file, write the schema into the same folder:
-#   ethbrake scenario schema > scenario.schema.json
+# With this schema an editor completes and checks this file:
+# yaml-language-server: $schema={schema}
 
 name: {name}
 title: One-line title for lists and figures
@@ -64,7 +63,8 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path
     values, path = base.declared(), scenario_path(based_on)
     if path.suffix and path == Path(based_on).expanduser():  # a path, and no name
         based_on = Path(os.path.relpath(path, folder)).as_posix()
-    text = _HEAD.format(name=name, base=base.name, based_on=flow_text(based_on))
+    schema = (shipped_folder() / "scenario.schema.json").as_uri()
+    text = _HEAD.format(name=name, base=base.name, based_on=flow_text(based_on), schema=schema)
     alternatives = ALTERNATIVES | {instead: key for key, instead in ALTERNATIVES.items()}
     for key, field in Scenario.model_fields.items():
         if key not in ("name", *DESCRIPTIVE_KEYS, "based_on"):

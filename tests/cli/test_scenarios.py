@@ -1,6 +1,7 @@
 """``ethbrake scenario``, new recipes, and ``--set``."""
 
 import json
+import re
 import runpy
 from pathlib import Path
 
@@ -57,19 +58,27 @@ def test_validate__drives_scripts_and_tells_which_fails_where(ethbrake: Command,
 def test_validate__of_a_wet_line_of_five_tells_all_capacities_on_this_road(ethbrake: Command, tmp_path: Path) -> None:
     path, shipped = tmp_path / "wet-five.yaml", ethbrake("scenario", "show", "cooperation-2-five").out
     path.write_text(shipped.replace("name: cooperation-2-five", "name: wet-five\nfriction: 0.4"))
-    told = " ".join(ethbrake("scenario", "validate", path).out.split())
-    assert all(f"{what}_capacity_{i}_mps2 3.924" in told for what in ("braking", "driving") for i in range(1, 6))
-    assert "; friction 0.4 early impacts: none" in told
+    told = [line.split() for line in ethbrake("scenario", "validate", path).out.splitlines()]
+    wet = [[f"{what}_capacity_{i}_mps2", "3.924"] for what in ("braking", "driving") for i in range(1, 6)]
+    assert all(line in told for line in [*wet, ["friction", "0.400"]])
 
 
 def test_show__prints_all_values_and_force_replaces_a_new_file(ethbrake: Command, tmp_path: Path) -> None:
-    shipped = {entry["name"]: entry["path"] for entry in told_json(ethbrake("scenario", "list", "--json"))}
+    shipped = {entry["name"]: entry["path"] for entry in told_json(ethbrake("scenario", "list", "--json"))["scenarios"]}
     assert ethbrake("scenario", "show", "stress-wide").out == Path(shipped["stress-wide"]).read_text()
     path = tmp_path / "mine.yaml"
     path.write_text("precious")
     words = ("scenario", "new", "mine", "--based-on", "paper-scenario-1", "--output", tmp_path, "--force")
     assert ethbrake(*words).status == 0 and "# gaps_m: [10, 8]" in path.read_text()
     assert "\ngaps_m: [10, 8]\n" in ethbrake("scenario", "show", path).out
+
+
+def test_list__has_the_names_that_files_can_use(ethbrake: Command) -> None:
+    parts = told_json(ethbrake("scenario", "list", "--json"))["parts"]
+    told = "".join(ethbrake("scenario", "list").out.split())
+    assert {"own", "front_K"} <= {*parts["Observation"]} and {"nominal"} <= {*parts["V2X presets"]}
+    assert {"ppo", "sac"} <= {*parts["Algorithms"]} and {"first", "total", "honest"} == {*parts["Counts of harm"]}
+    assert all(name.replace(" ", "") in told for names in parts.values() for name in names)
 
 
 def test_sample__draws_the_worlds_that_evaluate_draws(ethbrake: Command, tmp_path: Path) -> None:
@@ -91,13 +100,15 @@ def test_set__is_noted_in_a_training(ethbrake: Command, tiny_recipe: Path, tmp_p
 
 def test_new__on_a_table_has_its_rows(ethbrake: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trial, "WORLDS", 10)
-    table = "{columns: [gap_1_m, gap_2_m, recording], rows: [[9, 8, a], [7, 6, 'b, c']]}"
+    rows = ", ".join(f"[{k}, 6, r{k}]" for k in range(7, 17))
+    table = f"{{columns: [gap_1_m, gap_2_m, recording], rows: [[9, 8, a], [7, 6, 'b, c'], {rows}]}}"
     base = tmp_path / "base.yaml"
     base.write_text(f"name: base\ntable: {table}\nspeeds_mps: 20\nbraking_capacity_mps2: 6\n"
                     "driving_capacity_mps2: 6\nmass_t: 2\nlatency_s: 0.5\n")  # fmt: skip
     for name, based_on in (("mine", "recorded-openacc"), ("own", str(base))):
         ethbrake("scenario", "new", name, "--based-on", based_on, "--output", str(tmp_path))
-        assert ethbrake("scenario", "validate", str(tmp_path / f"{name}.yaml")).status == 0
+        answer = ethbrake("scenario", "validate", str(tmp_path / f"{name}.yaml"))
+        assert answer.status == 0 and re.search(r"\nrecording .* \.\.\.\s*\n", answer.out, re.DOTALL)
         new, old = (eb.load_scenario(path) for path in (str(tmp_path / f"{name}.yaml"), based_on))
         assert new.table == old.table
     refused = ethbrake("scenario", "new", "own", "--based-on", str(base), "--output", str(tmp_path))

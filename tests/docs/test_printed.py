@@ -5,8 +5,10 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -14,12 +16,13 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.pairwise import CLOSED_FORM_CANDIDATES, find_candidates, harm_of_deceleration, pairwise
-from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.motion.layout import BRAKING, LATENCY
-from ethbrake_marl.worlds.scenario_file import new_scenario_text
+from ethbrake_marl.training.recipe_file import recipe_schema
+from ethbrake_marl.worlds.scenario_file import new_scenario_text, scenario_json_schema
 from ethbrake_marl.worlds.user_worlds import worlds_from_table
 from tests.docs.printed import BLOCK, PAGES, PICTURES, ROOT, TABLES, missing_figures, pictures, rows, tables
 from tests.docs.site import DOCS, load
+from tests.fixtures.snapshots import check_snapshot
 from tests.programmes import bounds
 
 
@@ -155,14 +158,13 @@ def test_make__takes_only_a_python_that_suits(version: str, suits: bool, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("command", "file"), [("scenario schema", "scenarios/scenario"), ("train --schema", "train/recipe")]
+    ("schema", "file"), [(scenario_json_schema, "scenarios/scenario"), (recipe_schema, "train/recipe")]
 )
-def test_schema__that_ships_is_printed_by_the_command(
-    command: str, file: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run_command(command.split()) == 0
-    assert (ROOT / f"{file}.schema.json").read_text("utf-8") == capsys.readouterr().out
+def test_schema__that_ships_is_that_of_the_code(schema: Callable[[], dict[str, Any]], file: str) -> None:
+    """``ETHBRAKE_SNAPSHOTS=write`` writes the file."""
+    check_snapshot(ROOT / f"{file}.schema.json", json.dumps(schema(), indent=2) + "\n")
 
 
 def test_new_scenario__names_its_schema() -> None:
-    assert "# yaml-language-server: $schema=scenario.schema.json\n" in new_scenario_text("mine")
+    named = re.search(r"^# yaml-language-server: \$schema=file://(\S+)$", new_scenario_text("mine"), re.MULTILINE)
+    assert named and Path(unquote(named[1])) == ROOT / "scenarios" / "scenario.schema.json"

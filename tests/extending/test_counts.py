@@ -88,7 +88,7 @@ def test_count__is_a_setting_of_commands(capsys: pytest.CaptureFixture[str]) -> 
     line = "evaluate --episodes 3 --agents e_v2x_bm --set harm_count=shoves --json"
     assert run_command(line.split()) == 0
     assert json.loads(capsys.readouterr().out)[0]["shove_cost"] >= 0.0
-    assert run_command(["scenario", "parts"]) == 0 and "shoves" in capsys.readouterr().out
+    assert run_command(["scenario", "list"]) == 0 and "shoves" in capsys.readouterr().out
 
 
 def test_count__needs_what_it_requires() -> None:

@@ -218,7 +218,7 @@ def test_folder__makes_its_scenarios_known_by_name_and_to_the_command_line(
     rows = list(csv.DictReader((tmp_path / "out" / "worlds.csv").read_text().splitlines()))
     assert entry["parameters"]["scenario"] == "hills"
     assert entry["worst"] == near(np.mean([float(row["worst"]) for row in rows]))
-    origins = {entry["name"]: entry["origin"] for entry in json.loads(told("scenario", "list", "--json"))}
+    origins = {entry["name"]: entry["origin"] for entry in json.loads(told("scenario", "list", "--json"))["scenarios"]}
     assert (origins["hills"], origins["paper-random"]) == (str(folder), "shipped")
     eb.register_scenarios(str(folder))  # twice is once
     added = [entry for entry in eb.list_scenarios() if entry not in before]
