@@ -309,7 +309,7 @@ def test_terms_of_ones_own__count_where_a_reward_says_so() -> None:
     for _ in range(2):  # registered twice it is one
         register_term("one", one)
     register_term("gap_ahead", gap, unit="m")
-    for reward in ({"harm": 1.0}, {"harm": 1.0, "one": 0.0}, "harm"):
+    for reward in ({"harm": 1.0}, {"harm": 1.0, "one": 0.0}, "first-impact-harm"):
         assert [*paid(reward, *struck()).terms] == ["harm"]  # type: ignore[arg-type]
     step = paid({"harm": 0.0, "one": 2.0, "gap_ahead": -1.0}, *struck())
     assert step.reward[0] == near([2.0, 2.0 - 2.0, 2.0 - 10.25])
