@@ -6,7 +6,7 @@ import pytest
 from ethbrake_marl.extensions.messages.belief import ages_s, belief_of
 from ethbrake_marl.extensions.messages.links import MESSAGES_KEY, moved_on
 from ethbrake_marl.motion.elementary import hash_number
-from ethbrake_marl.motion.layout import GAP, HIT, SPEED
+from ethbrake_marl.motion.layout import FOREIGN, GAP, HIT, SPEED
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.extensions.messages.line import LINE, played, seen_by, stepped
 
@@ -86,6 +86,7 @@ def test_belief__knows_of_no_impact_between_others() -> None:
         state = stepped(game, state, 0.0)
     three = belief_of(state, 3)
     assert (three.line[0, HIT, 1], belief_of(state, 2).line[0, HIT, 1]) == (0.0, 1.0)
+    assert state.line[0, FOREIGN, 1] > 0.0 == three.line[0, FOREIGN, 1]
     assert three.line[0, SPEED, 1] < state.line[0, SPEED, 1]  # as if it had braked on
     assert three.line[0, GAP, 1] == 0.0  # moved on, the two would overlap
     present = played({"tells": ["place"]}, scenario=LINE.replace(gaps_m=[2, 30]))
