@@ -13,7 +13,10 @@ UNRULED = re.compile(
     r"(?<![.\w])(?<!def )(?:compile|__import__)\(|\.extractall\b|\.(?:to|read)_pickle\b|unsafe_load|runpy\."
     r"|joblib\.load\(|allow_pickle=(?!False)|(?<!json)\.load\([^)]*\b(?:device|map_location|custom_objects)=|torch\.load\((?![^)]*\bweights_only=True\))"
 )
-PLACES = {"ethbrake_marl/files/python_file.py"}  # a file that the user names is code
+PLACES = {
+    "ethbrake_marl/files/python_file.py",  # a file that the user names is code
+    "ethbrake_marl/files/package.py",  # the package itself, from the zip file that Python runs
+}
 
 
 def test_package__runs_no_code_from_files_but_in_the_named_places() -> None:

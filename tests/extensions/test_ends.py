@@ -11,6 +11,7 @@ from ethbrake_marl.episode.shaping import potential
 from ethbrake_marl.episode.state import END
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.extensions.search.pricing import problem_of
+from ethbrake_marl.motion.layout import FOREIGN
 from tests.contract.interfaces import PAPER
 from tests.faces.test_ends import check_ends, last, taken, told
 
@@ -46,8 +47,11 @@ def test_plans_and_searches__end_where_the_game_does() -> None:
     assert (problems[0].identity != problems[1].identity).all()
     ends = [problem.follow(problem.coasting()) for problem in problems]
     assert ends[0].harm("total").tolist() == ends[1].harm("total").tolist()
-    rear = np.maximum(ends[0].speeds_mps[:, 1] ** 2 - ends[0].speeds_mps[:, 0] ** 2, 0.0)
-    assert (ends[1].harm("honest") - ends[0].harm("honest")).tolist() == pytest.approx(rear.tolist()) and rear.any()
+    front, middle, rear = ends[0].speeds_mps.T
+    own = front - ends[0].line[:, FOREIGN, 1]  # without what Vehicle 2 has given it
+    motion = front**2 - own**2 + np.maximum(middle**2 - own**2, 0.0)
+    assert (ends[1].harm("honest") - ends[0].harm("honest")).tolist() == pytest.approx(motion.tolist())
+    assert (front > own).any() and (own > middle).any() and (middle > own).any() and (rear > 0.0).all()
     games = env.game, eb.open_game(shorter)[1]
     for game, last_state in zip(games, ends, strict=True):
         state = game.reset(worlds)

@@ -65,7 +65,7 @@ def test_infos__of_every_step_on_request_and_of_a_shield_always() -> None:
 
 @pytest.mark.parametrize(
     ("scenario", "make", "reward"),
-    [("paper-random", shield, {"harm": 1.0, "shaping": 0.1}), (line(3, v2x="nominal"), lambda env: env, "harm")],
+    [("paper-random", shield, {"harm": 1.0, "shaping": 0.1}), (line(3, v2x="nominal"), lambda env: env, "honest")],
     ids=["shield and shaping", "channel"],
 )
 def test_snapshot__can_be_restored_again_and_elsewhere(scenario: Any, make: Any, reward: Any) -> None:

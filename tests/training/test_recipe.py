@@ -93,7 +93,7 @@ def test_recipe__unknown_name_is_refused() -> None:
 @pytest.mark.usefixtures("core_alone")
 def test_recipe__of_an_absent_extension_is_refused_by_name() -> None:
     absent = shipped_recipes().keys() - usable_recipes()
-    assert len(absent) >= 5 and "ppo" not in absent
+    assert len(absent) >= 4 and "ppo" not in absent
     for name in absent:
         file = shipped_recipes()[name]
         with refused(f"; this algorithm belongs to the extension {file.parent.name}, which is not installed") as error:

@@ -304,7 +304,7 @@ def test_unknown_scenario__is_told_what_is_near() -> None:
 @pytest.mark.parametrize(("file", "name"), [("Wet Five.yml", "wet-five"), ("_a.b,c+d.yaml", "a-b-c-d")])
 def test_file__gives_its_scenario_the_name(file: str, name: str, empty_folder: Path) -> None:
     Path(file).write_text(new_scenario_text("mine"))
-    with pytest.warns(IgnoredName, match=f"line 13: name = mine is ignored: the file's name counts, so this is {name}"):
+    with pytest.warns(IgnoredName, match=f"line 12: name = mine is ignored: the file's name counts, so this is {name}"):
         assert load_scenario(file).name == name
     Path(file).write_text(new_scenario_text(name))
     assert load_scenario(file).name == name

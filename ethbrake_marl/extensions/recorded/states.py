@@ -112,7 +112,7 @@ def odd_places(states: Any, every_s: float) -> Bools:
         way, time_s = (x_then - x) * dx + (y_then - y) * dy, times_s[late] - times_s[early]
         error = np.abs(way - (v + v_then) / 2.0 * time_s)
         is_possible = (way >= -NOISE_M) & (way <= FASTEST_MPS * time_s + NOISE_M)
-        return ~(is_possible & (error <= NOISE_M + HARDEST_MPS2 / 4.0 * time_s**2))
+        return ~(is_possible & (error <= NOISE_M + HARDEST_MPS2 / 4.0 * time_s * time_s))
 
     for places in states.groupby("vehicle").indices.values():
         places = places[np.argsort(times_s[places], kind="stable")]

@@ -34,7 +34,10 @@ def test_targets__keep_the_slope_and_stay_within_the_radius_and_the_bounds() -> 
 @pytest.mark.parametrize("limit", [0.01, 1e9])
 def test_measured_gradients__are_those_of_the_return_up_to_their_limit(limit: float) -> None:
     """Two learners with their own objectives: the difference between two whole episodes, played by hand."""
-    recipe = VINE.replace(gradient_limit=limit, holds=[2], tried=32, reward={"harm": 1.0, "objective": "own"})
+    small = {"smallest": 1e-4, "largest": 2e-4}  # within it the cost has no jump
+    recipe = VINE.replace(
+        gradient_limit=limit, holds=[2], tried=32, offset=small, reward={"harm": 1.0, "objective": "own"}
+    )
     model = new_model(recipe, PAIR)
     states, seen = model.rows.episode.take(np.arange(8)), model._last_obs
     tried = model.try_out(Visited(seen, states))

@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.messages.belief import CAR_PIECES, ages_s, belief_of, known_pieces
 from ethbrake_marl.extensions.messages.links import MESSAGES_KEY, P_ACCELERATION, P_INTENT, P_PLACE, P_SPEED
-from ethbrake_marl.motion.layout import CAR_ROWS, FORCE, GAP, LIMIT, RESTITUTION, SCRIPTED, SPEED, WEIGHT
+from ethbrake_marl.motion.layout import CAR_ROWS, FORCE, GAP, LIMIT, RESTITUTION, SCRIPTED, SPEED
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.extensions.messages.line import played, stepped
 
@@ -36,7 +36,7 @@ CHANNELS = {
 
 
 def test_row_of_a_vehicle__is_told_by_a_piece_or_known_to_all() -> None:
-    assert sorted([*CAR_PIECES, LIMIT, WEIGHT, RESTITUTION, SCRIPTED]) == [*range(CAR_ROWS)]
+    assert sorted([*CAR_PIECES, LIMIT, RESTITUTION, SCRIPTED]) == [*range(CAR_ROWS)]
 
 
 def altered(state: State, observer: int, rng: np.random.Generator) -> State:
