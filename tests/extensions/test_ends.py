@@ -51,7 +51,7 @@ def test_plans_and_searches__end_where_the_game_does() -> None:
     own = front - ends[0].line[:, FOREIGN, 1]  # without what Vehicle 2 has given it
     motion = front**2 - own**2 + np.maximum(middle**2 - own**2, 0.0)
     assert (ends[1].harm("honest") - ends[0].harm("honest")).tolist() == pytest.approx(motion.tolist())
-    assert (front > own).any() and (own > middle).any() and (middle > own).any() and (rear > 0.0).all()
+    assert (front > own).any() and (middle > own).any() and (rear > own).any()
     games = env.game, eb.open_game(shorter)[1]
     for game, last_state in zip(games, ends, strict=True):
         state = game.reset(worlds)
