@@ -300,7 +300,7 @@ def test_game__has_the_training_worlds_and_sees_an_obstacle() -> None:
 
 
 def test_catalogue__has_groups() -> None:
-    assert len(list_scenarios()) == 61
+    assert len(list_scenarios()) == 60
     tasks = group_of_scenarios("benchmark")
     assert [task.removeprefix("benchmark-") for task in tasks] == [
         "all", "blocked", "five", "noisy", "pair", "single", "truck",
