@@ -75,6 +75,9 @@ def test_both_pairs__add_up():
     state.line[:, HIT] = 1.0  # further impacts count in total harm, and the honest cost is never below it
     first, total, honest = (lower_bound(state, harm_count=count).harm[0] for count in ("first", "total", "honest"))
     assert first == 0.0 and honest == total == pytest.approx(bound.harm[0])
+    paper = eb.load_scenario("paper-random").sample(6, seed=7)
+    total, honest = (lower_bound(paper, harm_count=count, time_step_s=0.1).harm for count in ("total", "honest"))
+    assert np.array_equal(honest, total) and honest.any()
 
 
 def test_early__impacts_before_the_latency_are_certain():
