@@ -39,6 +39,7 @@ from ethbrake_marl.motion.layout import (
     FORCE_GOAL,
     FORCE_RATE,
     FORCE_TIME,
+    FOREIGN,
     FRONT_CHANGE,
     GAP,
     HIGH,
@@ -278,6 +279,8 @@ def move_apart(line, car, scratch, duration, ahead, builds):
             acting = acts(onset, duration)
             if line[FORCE, i] != (command if acting else 0.0) or (acting and onset > 0.0):
                 return False
+        if line[EASED, i] == 0.0 and acts(onset, duration) and not is_full(command, car, i):
+            line[EASED, i] = 1.0
         after, way, steady = solo(speed, command, onset, car[LIMIT, i], duration)
         scratch[SPEED_GOAL, i], scratch[WAY, i] = after, way
         if i > ahead:
@@ -290,9 +293,8 @@ def move_apart(line, car, scratch, duration, ahead, builds):
                     return False
         slowest, front = min(speed, after), steady
     for i in range(ahead, bodies):
-        if not is_full(scratch[COMMAND, i], car, i) and acts(scratch[ONSET, i], duration):
-            line[EASED, i] = 1.0
-        note_foreign(line, i, 0.0, scratch[SPEED_GOAL, i])
+        if line[FOREIGN, i] > 0.0:
+            note_foreign(line, i, 0.0, scratch[SPEED_GOAL, i])
         line[SPEED, i] = scratch[SPEED_GOAL, i]
     for p in range(ahead, bodies - 1):
         line[GAP, p] = max(line[GAP, p] + (scratch[WAY, p] - scratch[WAY, p + 1]), 0.0)
