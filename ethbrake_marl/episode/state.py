@@ -39,8 +39,9 @@ NUMBER = 5  # number of the world in its list; -1: the caller has made it
 END = 6  # time at which the last step ends (s): the horizon, or earlier after `StepSettings.most_steps`
 HORIZON = 7  # the game's horizon (s), at which motion has a price
 KEY = 8  # key of the world's random generators
+ORIGIN = 9  # number of the table's row from which the world comes, from 1, the same for equal rows; 0: no table
 FIRST_IN_LIST = -2  # NUMBER of world 0 of an evaluation list that a reset asked for; the next ones are -3, -4, ...
-CLOCK_COLUMNS = 9
+CLOCK_COLUMNS = 10
 
 
 class State(NamedTuple):

@@ -17,7 +17,7 @@ from ethbrake_marl.agents.team import CHUNK, Team, agents_measures, check_knows,
 from ethbrake_marl.episode.counts import HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import KNOWLEDGE, MODEL, UNSTATED
-from ethbrake_marl.episode.state import STEPS, TIME, State
+from ethbrake_marl.episode.state import ORIGIN, STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation.measure_registry import check_measure_name, measures_called
 from ethbrake_marl.evaluation.measures import Measure, MeasureValues, Watch, measure_columns, naming, usual_measures
@@ -25,8 +25,9 @@ from ethbrake_marl.evaluation.provenance import about_scenario, policy_digests, 
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
 from ethbrake_marl.parallel import run_each
-from ethbrake_marl.worlds.describe import LABELS, clusters_of, columns_of
+from ethbrake_marl.worlds.describe import ALIKE, LABELS, clusters_of, columns_of, first_alike
 from ethbrake_marl.worlds.open_game import AnyScenario
+from ethbrake_marl.worlds.quantities import RECORDING
 from ethbrake_marl.worlds.sampling import DrawnWorlds
 
 Columns = dict[str, MeasureValues]
@@ -60,9 +61,17 @@ class Result:
         return len(self.worlds["world"])
 
     @property
-    def clusters(self) -> NDArray[np.str_] | None:
-        """Name of the traffic recording of each world, [n]; None if all worlds are independent."""
+    def clusters(self) -> NDArray[Any] | None:
+        """Recording, or row of a table, or first equal world, of each world, [n]; None if all are independent."""
         return clusters_of(self.worlds)
+
+    @property
+    def independent(self) -> dict[str, int]:
+        """Of what there are how many, on which intervals rest; empty if all worlds are independent."""
+        if self.clusters is None:
+            return {}
+        kinds = {RECORDING: "recordings", **ALIKE}
+        return {next(kinds[name] for name in kinds if name in self.worlds): len(np.unique(self.clusters))}
 
     def __getitem__(self, team: str) -> Columns:
         if team not in self.columns:
@@ -230,6 +239,9 @@ def evaluate_teams(
     reported = dict.fromkeys(name for part in parts for driven in part.values() for name in driven.reported)
     learners = game.settings.learners.tolist()
     columns: Columns = {**of_worlds}
+    alike = first_alike(draw.worlds)
+    if (alike != np.arange(n)).any():
+        columns["same_row_as" if draw.worlds.clock[:, ORIGIN].any() else "same_as"] = alike
     if (columns["world"] < 0).all():  # the user has made these worlds
         columns["world"] = np.arange(n)
     return Result(

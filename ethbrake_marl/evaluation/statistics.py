@@ -3,9 +3,10 @@
 Worlds are independent draws. Every agent drives the same worlds, so comparisons are paired by world, which removes the
 spread between easy and hard worlds. Sums are exactly rounded, so the order of the worlds does not matter.
 
-Worlds of one recording resemble each other. With ``clusters``, the name of each world's recording, [n], only recordings
-are independent. All estimates then come from each recording's sums, and are ratios ``r = sum x / sum y`` (a mean: y
-counts worlds). Recording g has the share ``h_g = y_g / sum y`` and the influence ``d_g = (x_g - r y_g) / sum y``:
+Worlds of one recording resemble each other; so do worlds from one row of a table, and equal worlds. With ``clusters``,
+the name of each world's recording (or row), [n], only recordings are independent. All estimates then come from each
+recording's sums, and are ratios ``r = sum x / sum y`` (a mean: y counts worlds). Recording g has the share ``h_g = y_g
+/ sum y`` and the influence ``d_g = (x_g - r y_g) / sum y``:
 
 - standard error: the jackknife, ``sqrt((G - 1) / G sum e_g^2)``, where ``e_g = d_g / (1 - h_g)`` is the change of r if
   recording g is left out;

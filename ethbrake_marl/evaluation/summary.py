@@ -42,6 +42,12 @@ SYMBOLS = {
 }  # fmt: skip
 STAY = "\u00a0"  # a space at which no line ends
 
+CLUSTERS = {  # entry of parameters -> words for one, and for several
+    "recordings": ("all worlds come from one recording", "recordings"),
+    "different_rows": ("all worlds come from one row of the table", "different rows of the table"),
+    "different_worlds": ("all worlds are equal", "different worlds"),
+}
+
 HEADINGS = {
     "Agent": "The agent that controls the vehicle. All other vehicles follow the scripts of the scenario. full_brake is"
     " the paper's non-ethical strategy (Non-E). e_v2x_bm brakes with the constant deceleration that is best in this"
@@ -310,9 +316,8 @@ def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
         )
         for team, team_columns in columns.items()
     ]
-    recordings: dict[str, int] = {} if clusters is None else {"recordings": int(clusters.max()) + 1}
     meant = {key: (measure, statistic) for key, (_, measure, statistic) in table_entries.items()}
-    return SummaryTable(rows, meant, {**result.about, **recordings, **ranges_of(result.worlds)})
+    return SummaryTable(rows, meant, {**result.about, **result.independent, **ranges_of(result.worlds)})
 
 
 def _statistics_of(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
@@ -427,13 +432,15 @@ def caption(parameters: Mapping[str, Any]) -> str:
             value = texts[0] if len(set(texts)) == 1 else f"({f',{STAY}'.join(texts)})"
             parts.append(f"{symbol}{STAY}={STAY}{value}{f'{STAY}{unit}' if unit else ''}")
     seed = "" if parameters.get("seed") is None else f", seed {parameters['seed']}"
-    worlds = f"{count_of(parameters['count'], 'world')}{seed}{by_recording(parameters.get('recordings', 0))}"
+    worlds = f"{count_of(parameters['count'], 'world')}{seed}{on_what_intervals_rest(parameters)}"
     physics = f" (physics: {parameters['physics']})" if "physics" in parameters else ""
     return f"{parameters['scenario']}{physics}: {worlds}; {'; '.join(parts)}"
 
 
-def by_recording(recordings: int) -> str:
-    """End of a caption: on how many recordings the 95 % intervals rest; empty for 0."""
-    if recordings == 1:
-        return "; no 95 % intervals: all worlds come from one recording"
-    return f"; 95 % intervals by {recordings:,} recordings" if recordings else ""
+def on_what_intervals_rest(parameters: Mapping[str, Any]) -> str:
+    """End of a caption; empty if all worlds are independent."""
+    for key, (one, several) in CLUSTERS.items():
+        if key in parameters:
+            count = parameters[key]
+            return f"; no 95 % intervals: {one}" if count == 1 else f"; 95 % intervals by {count:,} {several}"
+    return ""

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.state import NUMBER, State
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.episode.state import NUMBER, ORIGIN, State, arrays_of
+from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.worlds.quantities import CAR_QUANTITIES, QUANTITIES, RECORDING, USUAL
 from ethbrake_marl.worlds.sampling import DrawnWorlds, Texts
 
@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 
 LABELS = "labels"  # memory of worlds from a table of the user: name of a column of texts -> [n]
-OF_RESULTS = ("agent", "knows", "world", "hidden", "scenario")  # columns of results, which no label may be called
+# column of results, in which worlds are equal or from one row of a table (``first_alike``) -> what there are how many
+ALIKE = {"same_as": "different_worlds", "same_row_as": "different_rows"}
+# columns of results, which no label may be called
+OF_RESULTS = ("agent", "knows", "world", "hidden", "scenario", *ALIKE)
 
 
 def columns_of(drawn_worlds: DrawnWorlds) -> dict[str, NDArray[np.generic]]:
@@ -65,14 +68,31 @@ def kinds_of(drawn_worlds: DrawnWorlds) -> dict[str, Texts]:
     return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
 
 
-def clusters_of(columns: Mapping[str, NDArray[Any]]) -> Texts | None:
-    """Name of the cluster to which each world belongs, [n]; None if all worlds are independent.
+def first_alike(worlds: State) -> Ints:
+    """For each world the first one from the same row of a table or, without a table, the first equal one, [n].
 
-    Worlds of one recording depend on each other and form a cluster. The text before the last ": " in the column
-    ``recording`` is the name of the recording.
+    Equal worlds have equal vehicles, and the same luck with messages.
     """
-    if RECORDING not in columns:
-        return None
-    before, _, after = np.char.rpartition(columns[RECORDING], ": ").T
-    recording = np.where(before == "", after, before)
-    return np.where(recording == "", np.char.add(" ", columns["world"].astype(str)), recording)
+    origins, seen = worlds.clock[:, ORIGIN].tolist(), dict[Any, int]()
+    memories = {name: memory for name, memory in worlds.memories.items() if name != LABELS}
+    arrays = arrays_of((worlds.line, worlds.car, worlds.know, worlds.wanted, memories))
+
+    def key(k: int) -> Any:
+        return origins[k] or hash(tuple(array[k].tobytes() for array in arrays))
+
+    return np.array([seen.setdefault(key(k), k) for k in range(worlds.n)])
+
+
+def clusters_of(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any] | None:
+    """Name or number of the cluster to which each world belongs, [n]; None if all worlds are independent.
+
+    Worlds of one recording, of one row of a table, and equal worlds form a cluster. The text before the last ": " in
+    the column ``recording`` is the name of the recording.
+    """
+    alike = next((columns[name] for name in ALIKE if name in columns), columns["world"])
+    if RECORDING in columns:
+        before, _, after = np.char.rpartition(columns[RECORDING], ": ").T
+        recording = np.where(before == "", after, before)
+        return np.where(recording == "", np.char.add(" ", alike.astype(str)), recording)
+    is_clustered = not ALIKE.keys().isdisjoint(columns) and len(np.unique(alike)) < len(alike)
+    return alike if is_clustered else None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.state import KEY, State, mark
+from ethbrake_marl.episode.state import KEY, ORIGIN, State, mark
 from ethbrake_marl.episode.step import StepSettings, at_alert, first_decision
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.motion import layout
@@ -101,6 +101,8 @@ def draw_worlds(scenario: Scenario, n: int, seed: int, first: int, purpose: Purp
     member_index, parts = member_numbers(scenario, index, seed, purpose), []
     for k in np.unique(member_index):
         part = _draw_accepted(scenario.members[k], seed, purpose, index[member_index == k])
+        origin = part.worlds.clock[:, ORIGIN]
+        origin[:] = np.where(origin > 0.0, origin * len(scenario.members) + k, 0.0)  # members have tables of their own
         parts.append(part._replace(scenarios=np.full(part.worlds.n, scenario.members[k].name)))
     return merge_draws(parts, np.argsort(member_index, kind="stable"))
 
@@ -121,8 +123,12 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> DrawnWorlds:
     quantities = world_values(scenario, declared)
     if scenario.has_obstacle:
         quantities["obstacle_gap_m"] = obstacle_gap(scenario, quantities, declared)
+    worlds = state_of(scenario, quantities, numbers, scenario.unheard(kind), index)
+    if scenario.table is not None:
+        u = numbers(OF_WORLD, ROW[0])[:, ROW[1]]
+        worlds.clock[:, ORIGIN] = TableColumn(scenario.table.origins).value(u)
     return DrawnWorlds(
-        state_of(scenario, quantities, numbers, scenario.unheard(kind), index),
+        worlds,
         quantities["friction"][:, 0] if "friction" in quantities else np.full(n, np.nan),
         np.full((n, N), "") if line is None else np.array(line.names)[kind],
         np.full(n, ""),

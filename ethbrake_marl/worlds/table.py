@@ -19,7 +19,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import UNSHOWN, require, suggestion
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.worlds.quantities import QUANTITIES, RECORDING, QuantityEntry
 from ethbrake_marl.worlds.quantity import Number, ScenarioPart, pick
 
@@ -90,6 +90,12 @@ class Table(ScenarioPart):
                 else:
                     good = rule is not None and rule.allows(cell, cell)
                 require(good, ("rows", k, c), cell, right)
+
+    @cached_property
+    def origins(self) -> Ints:
+        """For each row a number from 1, the same for equal rows."""
+        origins: Ints = np.unique([repr(row) for row in self.rows or ()], return_inverse=True)[1] + 1
+        return origins
 
     @cached_property
     def by_name(self) -> dict[str, TableColumn]:

@@ -174,7 +174,7 @@ def measure_level(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None
     def stack_columns(names: Any) -> SeedColumns:
         return {column: np.stack([result[name][column] for name in names]) for column in numbers}
 
-    about = {**result.about, "policy_sha256": [dict(result.policies[name]) for name in teams]}
+    about = {**result.about, **result.independent, "policy_sha256": [dict(result.policies[name]) for name in teams]}
     return LevelResult(
         level,
         algorithm,

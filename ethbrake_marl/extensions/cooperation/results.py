@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, HarmCount
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.evaluate import SEED
+from ethbrake_marl.evaluation.summary import on_what_intervals_rest
 from ethbrake_marl.extensions.cooperation.ablation import CSV, FIGURE, FULL, JSON, Ablation, LevelResult
 from ethbrake_marl.extensions.cooperation.seeds import mean_over_seeds, share_over_seeds
 from ethbrake_marl.extensions.report.style import (
@@ -159,7 +160,7 @@ def ablation_results(plan: Ablation, measured: Sequence[LevelResult]) -> Json:
             "machine": machine,
             "date": datetime.now(UTC).date().isoformat(),
         },
-        "conditions": f"{conditions(plan)} {machine}.",
+        "conditions": f"{conditions(plan, measured)} {machine}.",
         **comparison(measured, plan.search_episodes),
     }
 
@@ -169,12 +170,13 @@ def write_ablation(plan: Ablation, measured: Sequence[LevelResult], results: Jso
     json_file, csv_file, picture = (plan.folder / name for name in (JSON, CSV, FIGURE))
     write_output(json_file, f"{json.dumps(results, indent=2, allow_nan=False)}\n".encode(), force=True)
     write_output(csv_file, levels_csv(measured, plan.search_episodes).encode(), force=True)
-    figure = ablation_figure(results, f"{conditions(plan)} Its line is as far below a bar as in these worlds.")
+    caption = f"{conditions(plan, measured)} Its line is as far below a bar as in these worlds."
+    figure = ablation_figure(results, caption)
     write_picture(picture, figure, force=True)
     return [json_file, csv_file, picture]
 
 
-def conditions(plan: Ablation) -> str:
+def conditions(plan: Ablation, measured: Sequence[LevelResult]) -> str:
     """Sentences that say how the results were made."""
     recipes = ", ".join(
         f"{name} (rewarded for {recipe.reward.harm_count.words})"
@@ -187,7 +189,8 @@ def conditions(plan: Ablation) -> str:
     return (
         f"{recipes}; {count_of(plan.seeds, 'seed')}, {plan.steps_per_learner:,} decisions of each learner, rounded up"
         " to whole updates. Harm and honest cost are means per world in m²/s² on"
-        f" {same_words}{count_of(plan.episodes, 'world')} of seed {SEED}{draw_words}; 95 % intervals for {scope}. Joint"
+        f" {same_words}{count_of(plan.episodes, 'world')} of seed {SEED}{draw_words}"
+        f"{on_what_intervals_rest(measured[0].about)}; 95 % intervals for {scope}. Joint"
         f" optimum: the least harm or cost known that the learners can cause, in the first {optimum}"
     )
 

@@ -25,8 +25,9 @@ CONFIDENCE = 0.95
 def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None) -> Estimate:
     """Mean over seeds and worlds of ``values``, or of ``values - baseline``.
 
-    The interval of a share contains Wilson's, because bootstrap intervals of nearly constant values are too narrow. Any
-    other estimate has none with one world or recording, or if all values are 0 without a baseline.
+    The interval of a share contains Wilson's, because bootstrap intervals of nearly constant values are too narrow. An
+    estimate from one recording has no interval; other estimates than shares have none with one world, or if all values
+    are 0 without a baseline.
     """
     array = np.atleast_2d(np.asarray(values))
     sides = [array, np.zeros((1, array.shape[1])) if baseline is None else np.atleast_2d(baseline)]
@@ -39,6 +40,8 @@ def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None
             return Estimate(value, None)
         return Estimate(value, (max(interval[0], 0.0), interval[1]))
     share = min(value, 1.0)  # the mean of values that are all 1 may be rounded up
+    if clusters is not None and interval is None:
+        return Estimate(share, None)
     if clusters is None:
         low, high = wilson(share, array.shape[1])
     else:

@@ -105,7 +105,8 @@ class Messages(ChannelKey):
         if _is_periodic(v2x):
             channel[:, PERIOD], channel[:, DELAY] = v2x.message_period_s, _delay_s(v2x)
             channel[:, LOSS_BEGINS], channel[:, LOSS_ENDS] = v2x.loss_begins, v2x.loss_ends
-            channel[:, KEY] = numbers(OF_WORLD, LATER_LOSSES)[:, 0] * 2.0**53
+            if self.is_random(v2x):
+                channel[:, KEY] = numbers(OF_WORLD, LATER_LOSSES)[:, 0] * 2.0**53
         return memory_at_alert(_contents(scenario), heard_s, seen_s, channel, _sample_count(scenario))
 
     def layer(self, v2x: V2X) -> Layer:

@@ -14,6 +14,7 @@ from ethbrake_marl.agent_names import open_game
 from ethbrake_marl.episode.counts import IMPACT_COUNTS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.comparison import Comparison
+from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episodes
 from ethbrake_marl.evaluation.summary import BASELINE
 from ethbrake_marl.extensions.rendering.scene import BODY_M
@@ -21,6 +22,7 @@ from ethbrake_marl.extensions.report.best_known import BestKnown
 from ethbrake_marl.extensions.report.page import Section, data, fill, page_part, printable_text
 from ethbrake_marl.extensions.report.style import quantities
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
+from ethbrake_marl.worlds.describe import ALIKE
 
 DATA = "episode_data"  # id of the data in a page; no section has it
 MOTION_SAMPLE_S = 0.005  # time between two samples of the motion
@@ -140,7 +142,7 @@ def shown_worlds(compared: Comparison, focus: str) -> dict[int, str]:
     cost, best_known, chosen = result[focus][column], BestKnown.of(result), dict[int, str]()
 
     def add(kind: str, rows: Iterable[int] | Ints, most: int = WORLDS_PER_KIND) -> None:
-        fresh = [int(row) for row in rows if int(row) not in chosen]
+        fresh = different_rows(result, [*chosen, *map(int, rows)])[len(chosen) :]
         chosen.update(dict.fromkeys(fresh[: min(most, MOST_WORLDS - len(chosen))], kind))
 
     add(f"Where {focus} did worst", worst_rows(compared, focus), WORST_WORLDS)
@@ -157,14 +159,23 @@ def shown_worlds(compared: Comparison, focus: str) -> dict[int, str]:
     return chosen
 
 
-def worst_rows(compared: Comparison, focus: str) -> Ints:
+def worst_rows(compared: Comparison, focus: str) -> list[int]:
     """Rows of the worlds with the largest cost of ``focus`` above the best known one (above 0, if none is known), worst
     first.
     """
     result, count, best_known = compared.result, compared.harm_count, BestKnown.of(compared.result)
     best = 0.0 if best_known is None else best_known.harm.get(count, 0.0)
     value = result[focus][count.column] - best
-    return rows_by_value(value, value > 0.0)[:WORST_WORLDS]
+    return different_rows(result, rows_by_value(value, value > 0.0).tolist())[:WORST_WORLDS]
+
+
+def different_rows(result: Result, rows: Sequence[int]) -> list[int]:
+    """Without rows whose world equals that of an earlier one, or is from the same row of a table."""
+    alike = next((result.worlds[name] for name in ALIKE if name in result.worlds), np.arange(result.n))
+    different = dict[int, int]()
+    for row in rows:
+        different.setdefault(int(alike[row]), row)
+    return [*different.values()]
 
 
 def rows_by_value(value: Floats, among: Bools) -> Ints:

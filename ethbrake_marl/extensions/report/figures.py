@@ -178,9 +178,7 @@ def harm_against_total_gap(result: Result) -> Figure:
 
 
 def line(result: Result) -> str:
-    by = result.clusters
-    recordings = {} if by is None else {"recordings": len(np.unique(by))}
-    return caption({**result.about, **recordings, **ranges_of(result.worlds)})
+    return caption({**result.about, **result.independent, **ranges_of(result.worlds)})
 
 
 DECELERATION_POINTS = 2001  # evenly spaced decelerations

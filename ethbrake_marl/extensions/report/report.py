@@ -200,7 +200,7 @@ def worst_section(compared: Comparison, focus: str, watched: Collection[int]) ->
             columns["An impact is"] = np.where(known_best.unavoidable, "unavoidable", "perhaps avoidable")
     columns["Impacts"] = result[focus]["impacts"]
     rows = []
-    for k in worst_rows(compared, focus).tolist():
+    for k in worst_rows(compared, focus):
         number = int(result.worlds["world"][k])
         name = CellText(page_part("watch", number)) if k in watched else number
         rows.append([name, *(values[k].item() for values in columns.values())])

@@ -10,7 +10,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import ALL_IMPACTS, BUILT_IN_COUNTS, FIRST_IMPACTS
-from ethbrake_marl.extensions.cooperation.ablation import Answer, LevelResult, can_imitate, least_known
+from ethbrake_marl.extensions.cooperation.ablation import Answer, LevelResult, can_imitate, least_known, measure_level
 from ethbrake_marl.extensions.cooperation.levels import Level
 from ethbrake_marl.extensions.cooperation.results import ablation_figure, comparison, levels_csv
 from ethbrake_marl.extensions.search.best_harm import best_harm
@@ -50,6 +50,17 @@ def test_change__says_who_is_worse_off_and_by_how_much() -> None:
         assert [each["value"] for each in change["vehicles"]] == pytest.approx([-0.25, -1.25, 0.75])
         assert change["worse_off"]["value"] == 0.5  # worlds 0 and 2
         assert change["worse_off_vehicles"] == [0.0, 0.25, 0.25]
+
+
+def test_level__of_a_table_rests_on_its_rows() -> None:
+    for rows in ([[7, 6], [8, 6], [6, 9]], [[7, 6]]):
+        table = {"columns": ["gap_1_m", "gap_2_m"], "rows": rows}
+        scenario = eb.load_scenario("level-1-messages").replace(gaps_m=None, speeds_mps=20, table=table)
+        result = measure_level(Level("mine", scenario), scenario.draw(60, 7), None, ())
+        assert result.about["different_rows"] == len(np.unique(result.clusters)) == len(rows)
+        (level,) = comparison([result], 30)["levels"]
+        for estimate in (level["collision_rate"], level["honest"]["harm"], level["first"]["searched"]["full_brake"]):
+            assert (estimate["interval"] is None) == (len(rows) == 1), estimate
 
 
 def test_level__share_of_the_reduction_and_too_little_training_by_hand() -> None:

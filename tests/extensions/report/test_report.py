@@ -131,9 +131,26 @@ def test_worlds__are_ranked_by_what_the_agents_minimise(compared: Comparison, se
     section = " ".join(map(str, worst_section(honest, "ppo", ()).body))
     assert "did worst, by honest cost." in section and section.count("Honest cost") == 1
     unknown = searched._replace(harm_count=HONEST)  # no best known honest cost
-    assert worst_rows(unknown, "ppo").tolist() == worst_rows(honest, "ppo").tolist()
+    assert worst_rows(unknown, "ppo") == worst_rows(honest, "ppo")
     section = " ".join(map(str, worst_section(unknown, "ppo", ()).body))
     assert "by honest cost." in section and section.count("Honest cost") == 1
+
+
+def test_shown__are_different_worlds() -> None:
+    """Twelve rows of a table, drawn many times: each is shown once."""
+    columns = ["gap_1_m", "gap_2_m", "speed_2_mps"]
+    rows = [[7.0 + k % 4, 6.0 + k / 3.0, 20.0 + k % 3] for k in range(12)]
+    scenario = eb.load_scenario("paper-random").replace(table={"columns": columns, "rows": rows}, gaps_m=None)
+    tabled = compared_by(scenario, AGENTS, 120)
+    origins = tabled.result.worlds["same_row_as"]
+    assert len({*origins.tolist()}) == 12
+    for focus in AGENTS:
+        worst, shown = worst_rows(tabled, focus), [*shown_worlds(tabled, focus)]
+        assert len({*origins[worst].tolist()}) == len(worst) == min(10, len(worst))
+        assert {*origins[shown].tolist()} == {*origins.tolist()} and len(shown) == 12 and shown[: len(worst)] == worst
+    text = str(worst_section(tabled, FOCUS, ()).body[1])
+    assert text.count("<tr") == len(worst_rows(tabled, FOCUS)) + 1
+    assert "95 % intervals by 12 different rows of the table" in ReportPage("A page", tabled, "x", {}).html
 
 
 @pytest.mark.parametrize(("count", "known"), [("total", True), ("honest", False)])
@@ -158,7 +175,7 @@ def test_worlds__to_watch_are_those_of_the_cost_that_the_agents_minimise(
 
 
 def test_worst_worlds__can_be_watched(searched: Comparison) -> None:
-    shown = worst_rows(searched, FOCUS).tolist()[:3]
+    shown = worst_rows(searched, FOCUS)[:3]
     text = str(worst_section(searched, FOCUS, shown).body[1])
     assert text.count("data-watch") == 3 and text.count("avoidable") == 10
     assert f'data-watch="{shown[0]}"' in text and f"{searched.result[FOCUS]['total_harm'][shown[0]]:.2f}" in text
