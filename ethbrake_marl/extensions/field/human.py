@@ -66,8 +66,8 @@ class Human(Controller):
     """A driver behind, whose reaction time is drawn once a world.
 
     The driver sees the vehicle ahead as it was one reaction time ago, expects it to go on so (but to lose at most the
-    share ``foresight`` of its speed), and knows the own motion. With the expected gap d and speed w, and the own speed v, the command
-    is the smaller one of ``k min(1, reach / d) (w - v)``, with the sensitivity k, and minus the
+    share ``foresight`` of its speed), and knows the own motion. With the expected gap d and speed w, and the own speed
+    v, the command is the smaller one of ``k min(1, reach / d) (w - v)``, with the sensitivity k, and minus the
     ``required_deceleration`` for a gap that is shorter by ``margin`` (at most by a half). The first never leads beyond
     the speed at the alert, the second never below the speed ahead. Decelerations grow by at most ``jerk``.
 

@@ -61,8 +61,8 @@ def test_rss__brakes_within_the_safe_distance() -> None:
 def test_aeb__brakes_fully_from_its_time_to_collision_until_rest() -> None:
     # 10 m/s closing over 14 m is 1.4 s; 12 m/s over 19 m is 1.58 s, which asks for 144 / 38 = 3.8 m/s2.
     def brakes(spec, gap, speed, front, memory=np.inf):
-        state, agent = state_of([[gap]], [[front, speed]], braking_capacity_mps2=[6.0, 7.0]), eb.make_agent(spec, scenario=TWO)
-        return agent.act(state, np.array([memory]), 2)[0][0] == -7.0
+        state = state_of([[gap]], [[front, speed]], braking_capacity_mps2=[6.0, 7.0])
+        return eb.make_agent(spec, scenario=TWO).act(state, np.array([memory]), 2)[0][0] == -7.0
 
     assert brakes("aeb", 14, 20, 10) and not brakes("aeb", 16, 20, 10) and not brakes("aeb", 19, 22, 10)
     assert brakes("aeb:required=3.7", 19, 22, 10) and not brakes("aeb:required=3.9", 19, 22, 10)

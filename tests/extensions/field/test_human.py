@@ -1,4 +1,4 @@
-"""The agent ``human``: required decelerations, reaction times and a braking by hand; light touches do not startle it."""
+"""The agent ``human``: required decelerations, reaction times and braking by hand; a light touch startles nobody."""
 
 from itertools import pairwise
 
@@ -67,7 +67,7 @@ def test_reaction_times__are_drawn_once_a_world_or_fixed() -> None:
 
 
 def test_braking__by_hand() -> None:
-    """Vehicle 1 brakes with 6 m/s2 from 30 m/s, 50 m ahead. The first view of it is at 0.05 s, and acted on at 0.55 s."""
+    """Vehicle 1 brakes with 6 m/s2 from 30 m/s, 50 m ahead. What is seen at 0.05 s is acted on at 0.55 s."""
     pair = eb.Scenario(
         name="two", vehicles=2, gaps_m=50, speeds_mps=30, braking_capacity_mps2=[6, 9], driving_capacity_mps2=3,
         mass_t=1, latency_s=[0, 0.05], restitution=0,
