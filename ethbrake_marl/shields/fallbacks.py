@@ -93,7 +93,9 @@ def write_candidates(car, clock, learners, plans, changes, single_actions, actio
                 commands[row, j, c] = action * capacity(car[row], BRAKING, learners[c])
 
 
-def ask_agents(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
+def ask_agents(
+    drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]
+) -> tuple[Floats, dict[int, Any]]:
     """Actions of a shield's agents, [n, L], and their new ``memories``.
 
     Only these agents hear each other's plans. Nobody else does, because a shield may apply other actions.

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.layer import MESSAGES
+from ethbrake_marl.episode.layer import MESSAGES, check_seen
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.field.controllers import (
     LEAST_GAP_M,
@@ -27,6 +27,7 @@ from ethbrake_marl.motion.elementary import exp_each, log, normal_quantile_each
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
 
+CREEPING_MPS = 1.0  # a slower driver behind a standing vehicle brakes to rest with this number of m/s2
 LONGEST_SDS = 3.0  # standard deviations above the mean: the longest reaction time
 DEFAULTS = {
     "reaction": 1.21, "sd": 0.63,  # s; unalerted drivers behind brake lights ("Radar-measured reaction times ...")
@@ -87,6 +88,7 @@ class Human(Controller):
         return Sight(reaction, motion.speed_mps.copy(), np.zeros(alert.n), motion.speed_mps.copy(), views)
 
     def act(self, state: State, memory: Sight, body: int) -> tuple[Floats, Sight]:
+        check_seen(self, state, body)
         p, motion, time = self.parameters, KnownMotion.of(state, body, self.step_s), state.time_s
         way = memory.way_m + 0.5 * (memory.speed_mps + motion.speed_mps) * (time - memory.views[:, -1, 0])
         view = np.stack([time, way + motion.gap_m, motion.front_mps, motion.front_mps2], axis=1)
@@ -102,6 +104,8 @@ class Human(Controller):
         gap = place + front * age - slower * (age - 0.5 * slowing_s) - way
         sensitivity = p.sensitivity * np.minimum(1.0, p.reach / np.maximum(gap, LEAST_GAP_M))
         follow = sensitivity * (np.minimum(expected, memory.alert_mps) - motion.speed_mps)
+        stops = (expected == 0.0) & (gap < p.reach) & (motion.speed_mps < CREEPING_MPS)
+        follow = np.where(stops, np.minimum(follow, -CREEPING_MPS), follow)
         room = np.maximum(np.maximum(gap - p.margin, 0.5 * gap), LEAST_GAP_M)
         required = required_deceleration(room, motion.speed_mps, expected, braking)
         evens = braking + np.maximum(motion.speed_mps - expected, 0.0) / self.step_s  # to the speed ahead, in one step
@@ -116,7 +120,7 @@ def make_human(argument: str | None, settings: Any) -> Human:
 
 HUMAN = Part(
     make_human,
-    form="human[:reaction=1.21:sd=0.63]",
-    about="a driver who sees late, brakes as hard as necessary, and lets go again",
+    form="human[:reaction=1.21]",
+    about="a driver who sees late, and brakes as hard as necessary",
     knows=MESSAGES,
 )

@@ -61,6 +61,8 @@ def search_in_game(
     for k in range(len(proposals) + candidates):
         proposal = proposals[k] if k < len(proposals) else changed(best, low, span, numbers, k - len(proposals))
         rows = np.flatnonzero(least > 0.0)
+        if not len(rows):
+            break
         last = play_to_end(game, alert.take(rows), Team("commands", {body: Commands(proposal[rows])}))
         harm = amounts(objectives_of(objective, alert.vehicles), None, last, harm_count)[:, body - 1]
         better = rows[harm < least[rows]]
