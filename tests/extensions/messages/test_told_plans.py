@@ -143,7 +143,9 @@ def test_plan_that_is_none__is_the_fault_of_who_tells_it(kind: str, plan: list[A
         scenario = line(2).replace(roles={"vehicle_1": "says", "vehicle_2": "learner", "vehicle_3": "listening"})
         team = eb.Team("mine", {2: eb.make_agent("coast")})
     scenario, game = eb.open_game(scenario)
-    with pytest.raises(AgentFailed, match=r"says.*vehicle_1: tells the plan .* must be 2 times in order, then 3 finite"):
+    with pytest.raises(
+        AgentFailed, match=r"says.*vehicle_1: tells the plan .* must be 2 times in order, then 3 finite"
+    ):
         list(eb.play(game, scenario.sample(4, 7), eb.shield(team) if kind == "shielded" else team))
 
 
