@@ -115,7 +115,7 @@ def _trial_content(scenario: Scenario, trial: Trial) -> dict[str, Any]:
 
     quantities = {
         name: dict(zip(("least", "median", "largest"), np.nanquantile(column, (0.0, 0.5, 1.0)).tolist(), strict=True))
-        for name, column in quantities_of(trial.drawn.worlds, trial.drawn.friction).items()
+        for name, column in quantities_of(trial.drawn.worlds, trial.drawn.road).items()
         if not np.isnan(column).all()
     }
     return {
@@ -237,7 +237,7 @@ def scenario_sample(
         usual = TABLE_WORLDS if picture_file is None else PICTURE_WORLDS
         n = usual if episodes is None else episodes
         draw = chosen.draw(n, seed)
-        quantities, fixed = quantities_of(draw.worlds, draw.friction), fixed_columns(chosen)
+        quantities, fixed = quantities_of(draw.worlds, draw.road), fixed_columns(chosen)
         columns = {name: column.tolist() for name, column in quantities.items() if name not in fixed}
         states = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         states = [{name: None if value != value else value for name, value in row.items()} for row in states]

@@ -63,6 +63,8 @@ def _check_declared_once(scenario: Scenario) -> None:
     alone = "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None
     right = "can be used only with line_speed_mps, the speed to which the deviations are added"
     require(not alone, ("speed_deviations_mps",), scenario.speed_deviations_mps, right)
+    right = "can be used only with friction, of which it is a share"
+    require("friction" in scenario.sources or "grip" not in scenario.sources, ("grip",), scenario.grip, right)
 
 
 def _check_channel(scenario: Scenario) -> None:

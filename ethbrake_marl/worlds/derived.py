@@ -30,8 +30,9 @@ def world_values(
     There is an entry for each vehicle or pair, or one for the world. ``declared(key)`` returns the drawn values of a
     declared quantity, [k, entries]. Other quantities follow: ``speed = line speed + own deviation``, ``latency = own
     latency + time of the alert``, ``gap = time gap x speed of the rear vehicle``. Friction limits capacities to
-    friction x gravity. ``settle(key, values)`` may replace the values of a quantity before they enter gaps and limits.
-    No result decreases if a declared quantity increases, so bounds of declared quantities give bounds of the results.
+    friction x grip x gravity. ``settle(key, values)`` may replace the values of a quantity before they enter gaps and
+    limits. No result decreases if a declared quantity increases, so bounds of declared quantities give bounds of the
+    results.
     """
     keys = [key for key in (*USUAL, *OPTIONAL) if key != "obstacle_gap_m" and key in scenario.sources]
     values = {key: declared(key) for key in keys}
@@ -43,8 +44,9 @@ def world_values(
     if scenario.time_gaps_s is not None:
         values["gaps_m"] = settle("gaps_m", declared("time_gaps_s") * values["speeds_mps"][:, 1:])
     if "friction" in values:
+        limit = values["friction"] * GRAVITY_MPS2 * values.get("grip", np.ones(1))
         for key in ("braking_capacity_mps2", "driving_capacity_mps2"):
-            values[key] = np.minimum(values[key], values["friction"] * GRAVITY_MPS2)
+            values[key] = np.minimum(values[key], limit)
     return values
 
 

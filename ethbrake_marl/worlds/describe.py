@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,24 +28,23 @@ OF_RESULTS = ("agent", "knows", "world", "hidden", "scenario", *ALIKE)
 def columns_of(drawn_worlds: DrawnWorlds) -> dict[str, NDArray[np.generic]]:
     worlds = drawn_worlds.worlds
     kinds = {**worlds.memories.get(LABELS, {}), **kinds_of(drawn_worlds)}
-    return {"world": worlds.clock[:, NUMBER].astype(np.int64), **kinds, **quantities_of(worlds, drawn_worlds.friction)}
+    return {"world": worlds.clock[:, NUMBER].astype(np.int64), **kinds, **quantities_of(worlds, drawn_worlds.road)}
 
 
-def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str, Floats]:
+def quantities_of(worlds: State, road: Mapping[str, Floats] = MappingProxyType({})) -> dict[str, Floats]:
     """Quantities of worlds at the alert, column -> [n], as ``worlds_from_table`` reads them.
 
-    Capacities include the limit that the road's ``friction`` [n] sets. The distance to an obstacle is NaN in a world
+    Capacities include the limit of the ``road`` (``DrawnWorlds.road``). The distance to an obstacle is NaN in a world
     without one. An infinite rate becomes the largest valid number.
     """
     values = {"gaps_m": worlds.gaps_m, "speeds_mps": worlds.speeds_mps}
     values |= {key: worlds.car[:, row, 1:] for key, row in CAR_QUANTITIES.items()}
     gap = worlds.obstacle_gap_m[:, np.newaxis]
     values["obstacle_gap_m"] = np.where(np.isfinite(gap), gap, np.nan)
-    values["friction"] = np.broadcast_to(friction, worlds.n)[:, np.newaxis]
+    values |= road
     is_present = {
         key: np.isfinite(values[key]).any() for key in ("obstacle_gap_m", "brake_rate_mps3", "release_rate_mps3")
     }
-    is_present["friction"] = np.isfinite(values["friction"]).all()
     return {
         QUANTITIES[key].column_of(i): np.minimum(column, QUANTITIES[key].high)
         for key in QUANTITIES

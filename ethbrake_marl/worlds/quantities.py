@@ -16,7 +16,7 @@ OBSTACLE_STREAM = (2,)
 TYPES = (3,)  # types and loads of the vehicles
 MIXTURE = (4,)  # scenario of a mixture
 SURROUNDINGS = (6,)  # friction, row of the table, time before the alert
-BRAKES = (7,)  # brake rates, release rates
+BRAKES = (7,)  # brake rates, release rates, grip
 GENERATORS = (8,)  # key of the random generators of scripts
 
 NUMBERS_PER_VEHICLE = 8  # numbers of one vehicle in the streams MAIN and BRAKES
@@ -154,6 +154,11 @@ _OPTIONAL = (
         "friction", "", "world", 2.0, True, 0,
         "friction of the road; it limits braking and driving capacities to friction x 9.81 m/s2",
         "{uniform: [0.2, 0.9]}", "friction", stream=SURROUNDINGS,
+    ),
+    Rule(
+        "grip", "", "vehicle", 1.0, True, 3,
+        "share of the road's friction that the tyres of each vehicle reach; all of it without this key",
+        "{uniform: [0.8, 1]}", "grip_{}", stream=BRAKES,
     ),
     Rule(
         "brake_rate_mps3", "mps3", "vehicle", 1e6, True, 0,

@@ -49,15 +49,23 @@ Texts = NDArray[np.str_]
 class DrawnWorlds(NamedTuple):
     worlds: State
     friction: Floats  # [n] of the road; NaN where it has none
+    grip: Floats  # [n, N] of each vehicle; NaN where it has none
     types: Texts  # [n, N] vehicle types; "" without
     scenarios: Texts  # [n] member of the mixture; "" without
     recordings: Texts  # [n] cell of the table's column `recording`; "" without
     rejected: int = 0  # draws with an impact before the first learner could act
 
+    @property
+    def road(self) -> dict[str, Floats]:
+        """Key of a quantity of the road -> values, [n, entries]; only quantities that all worlds have."""
+        quantities = {"friction": self.friction[:, np.newaxis], "grip": self.grip}
+        return {key: values for key, values in quantities.items() if np.isfinite(values).all()}
+
     @classmethod
     def from_state(cls, worlds: State) -> DrawnWorlds:
-        n = worlds.n
-        return cls(worlds, np.full(n, np.nan), np.full((n, worlds.vehicles), ""), np.full(n, ""), np.full(n, ""))
+        n, N = worlds.n, worlds.vehicles
+        none, no_text = np.full((n, N), np.nan), np.full((n, N), "")
+        return cls(worlds, none[:, 0], none, no_text, no_text[:, 0], no_text[:, 0])
 
 
 class WorldPool:
@@ -130,6 +138,7 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> DrawnWorlds:
     return DrawnWorlds(
         worlds,
         quantities["friction"][:, 0] if "friction" in quantities else np.full(n, np.nan),
+        quantities.get("grip", np.full((n, N), np.nan)),
         np.full((n, N), "") if line is None else np.array(line.names)[kind],
         np.full(n, ""),
         np.full(n, "") if column is None else column.value(numbers(OF_WORLD, ROW[0])[:, ROW[1]]),
@@ -200,7 +209,7 @@ def _draw_accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> 
         rejected, attempt = rejected + len(pending), attempt + 1
         redrawn_worlds = draw_once(scenario, uniform_numbers(seed, purpose, attempt, index[pending]), index[pending])
         drawn_worlds.worlds.put(pending, redrawn_worlds.worlds, donate=True)
-        for column, redrawn_column in zip(drawn_worlds[1:5], redrawn_worlds[1:5], strict=True):
+        for column, redrawn_column in zip(drawn_worlds[1:6], redrawn_worlds[1:6], strict=True):
             column[pending] = redrawn_column
         pending = pending[has_early_impact(scenario, redrawn_worlds.worlds)]
     if not len(pending):
@@ -229,6 +238,6 @@ def merge_draws(parts: Sequence[DrawnWorlds], place: Ints) -> DrawnWorlds:
         return np.concatenate(arrays)[order]
 
     worlds = State.join([part.worlds for part in parts], of_parts)
-    friction, types, scenarios, recordings = map(of_parts, zip(*(part[1:5] for part in parts), strict=True))
+    friction, grip, types, scenarios, recordings = map(of_parts, zip(*(part[1:6] for part in parts), strict=True))
     rejected = sum(part.rejected for part in parts)
-    return DrawnWorlds(worlds, friction, types, scenarios, recordings, rejected)
+    return DrawnWorlds(worlds, friction, grip, types, scenarios, recordings, rejected)

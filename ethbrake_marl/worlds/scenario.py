@@ -139,6 +139,7 @@ class Scenario(ScenarioPart):
     obstacle_gap_m: Quantity | None = _quantity("obstacle_gap_m")
     obstacle_margin_m: Quantity | None = _quantity("obstacle_margin_m")
     friction: Quantity | None = _quantity("friction", exclude_if=not_)
+    grip: PerVehicle | None = _quantity("grip", exclude_if=not_)
     brake_rate_mps3: PerVehicle | None = _quantity("brake_rate_mps3", exclude_if=not_)
     release_rate_mps3: PerVehicle | None = _quantity("release_rate_mps3", exclude_if=not_)
     alert_s: Quantity | None = _quantity("alert_s", exclude_if=not_)

@@ -109,6 +109,10 @@ ROLES = {"vehicle_1": "constant:2", "vehicle_2": "learner", "vehicle_3": "my_age
             {"gaps_m": [9, 11], "speeds_mps": [20, 18, 22]},
         ),
         ({"friction": 0.5}, {"braking_capacity_mps2": [0.5 * 9.81] * 3, "driving_capacity_mps2": [0.5 * 9.81] * 3}),
+        (
+            {"friction": 0.5, "grip": [1, 0.9, 0.8]},
+            {name: [4.905, 4.4145, 3.924] for name in ("braking_capacity_mps2", "driving_capacity_mps2")},
+        ),
         ({"friction": 2}, {"braking_capacity_mps2": [6, 7, 6], "obstacle_gap_m": np.inf}),
         ({"alert_s": 1.5}, {"latency_s": [1.5, 2, 2.3]}),
         ({"obstacle_gap_m": 42}, {"obstacle_gap_m": 42}),
@@ -135,6 +139,22 @@ def test_world__by_hand(given: dict[str, Any], expected: dict[str, Any]) -> None
     assert scenario.has_obstacle == np.isfinite(worlds.obstacle_gap_m[0])
 
 
+@pytest.mark.parametrize("name", ["realistic-motorway", "realistic-pair", "realistic-platoon", "recorded-openacc"])
+def test_road__is_one_for_the_line__and_each_vehicle_has_its_share(name: str) -> None:
+    drawn = load_scenario(name).draw(300, 7)
+    share = drawn.worlds.braking_capacity_mps2 / (9.81 * drawn.friction[:, np.newaxis])
+    assert 0.5 <= drawn.friction.min() < 0.55 < 0.85 < drawn.friction.max() <= 0.9
+    assert share == pytest.approx(drawn.grip) and 0.8 <= share.min() < 0.82 < 0.98 < share.max() <= 1.0
+    assert abs(np.corrcoef(share.T) - np.eye(share.shape[1])).max() < 0.2  # by itself
+
+
+def test_road__is_refused_without_friction() -> None:
+    with refused("grip = 0.9: can be used only with friction, of which it is a share"):
+        line(grip=0.9)
+    with refused("grip[1] (vehicle_2) = 1.1: must be finite and in (0, 1]"):
+        line(friction=0.5, grip=[1, 1.1, 1])
+
+
 def test_bounds__hold_for_every_draw() -> None:
     drawn = line().replace(
         time_gaps_s={"uniform": [0.2, 2]},
@@ -146,6 +166,9 @@ def test_bounds__hold_for_every_draw() -> None:
     worlds = drawn.sample(2000, 7)
     assert 8.0 <= worlds.speeds_mps.min() < 10.0 < 38.0 < worlds.speeds_mps.max() <= 40.0
     assert line(friction={"uniform": [0.1, 0.9]}).bounds("braking_capacity_mps2")[0] == (0.1 * 9.81, 6.0)
+    tyres = line(friction={"uniform": [0.1, 0.4]}, grip=[{"uniform": [0.5, 1]}, 0.8, 1])
+    of_first, of_second = ((0.05 * 9.81, 0.4 * 9.81), (0.1 * 9.81 * 0.8, 0.4 * 9.81 * 0.8))
+    assert tyres.bounds("braking_capacity_mps2")[:2] == (of_first, of_second)
     assert load_scenario("mixture-delays").bounds("latency_s") == ((0.0, 0.0), (0.1, 0.8), (0.3, 1.2))
 
 

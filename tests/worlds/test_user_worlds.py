@@ -40,7 +40,7 @@ def test_state__is_filled_in_with_what_is_fixed(scenario: Any, state: Any, expec
 def test_table_of_what_was_drawn__is_the_same_worlds(name: str) -> None:
     scenario = load_scenario(name)
     drawn = scenario.draw(50, 3)
-    given = worlds_from_table(scenario, quantities_of(drawn.worlds, drawn.friction))
+    given = worlds_from_table(scenario, quantities_of(drawn.worlds, drawn.road))
     for part in ("line", "car", "know", "wanted"):
         assert getattr(given, part).tobytes() == getattr(drawn.worlds, part).tobytes(), part
     clock = drawn.worlds.clock.copy()

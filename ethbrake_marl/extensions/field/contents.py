@@ -9,6 +9,7 @@ CONTENTS = {
         "r157_human": "controllers:R157_HUMAN",
         "r157_fsm": "controllers:R157_FSM",
         "aeb": "controllers:AEB",
+        "human": "human:HUMAN",
         "synchronised": "synchronised:AGENT",
         "field": "controllers:FIELD",
     },

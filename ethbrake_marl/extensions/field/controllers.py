@@ -116,9 +116,10 @@ def _human(motion: KnownMotion, p: Parameters) -> Floats:
     return motion.built_up(np.full_like(motion.gap_m, -p.most), p.jerk)
 
 
-def _human_notices(motion: KnownMotion, p: Parameters) -> Bools:
+def _human_notices(motion: KnownMotion, p: Parameters, noticed: Bools) -> Bools:
     brakes = (motion.front_mps2 < -p.front) & (motion.headway_s < p.headway)
-    return brakes | (motion.until_contact_s < p.ttc)
+    is_near = motion.gap_m <= p.margin + p.headway * motion.speed_mps
+    return brakes | (motion.until_contact_s < p.ttc) | (noticed & is_near)
 
 
 def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
@@ -149,9 +150,9 @@ def fuzzy_criteria(motion: KnownMotion, p: Parameters) -> tuple[Floats, Floats]:
     return proactive, np.where(speed > front, critical, 0.0)
 
 
-def _fsm_notices(motion: KnownMotion, p: Parameters) -> Bools:
+def _fsm_notices(motion: KnownMotion, p: Parameters, noticed: Bools) -> Bools:
     proactive, critical = fuzzy_criteria(motion, p)
-    return (motion.closing_mps > 0.0) & (proactive + critical > 0.0)
+    return (proactive + critical > 0.0) & (noticed | (motion.closing_mps > 0.0))
 
 
 def _fsm(motion: KnownMotion, p: Parameters) -> Floats:
@@ -161,8 +162,13 @@ def _fsm(motion: KnownMotion, p: Parameters) -> Floats:
 
 
 def _aeb(motion: KnownMotion, p: Parameters) -> Floats:
+    return np.full_like(motion.gap_m, -np.inf)
+
+
+def _aeb_notices(motion: KnownMotion, p: Parameters, noticed: Bools) -> Bools:
     required = np.square(np.maximum(motion.closing_mps, 0.0)) / (2.0 * motion.gap_m)
-    return np.where((motion.until_contact_s < p.ttc) | (required > p.required), -np.inf, 0.0)
+    begins = (motion.until_contact_s < p.ttc) | (required > p.required)
+    return begins | (noticed & (motion.until_contact_s <= p.release_ttc))
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,12 +179,21 @@ class Law:
     source: str  # publication of the formula
     parameters: Mapping[str, float]  # default value of each parameter, in SI units
     command: Callable[[KnownMotion, Parameters], Floats]  # function that returns the acceleration, [n] m/s2
-    # Function that returns for each world whether there is a danger, [n] bool. None: the law acts from the start.
-    notices: Callable[[KnownMotion, Parameters], Bools] | None = None
-    stays: bool = False  # whether the reaction continues after the danger is over
+    # Function that returns for each world whether there is a danger, [n] bool; its last argument says where there was
+    # one at the last decision. None: the law acts from the start.
+    notices: Callable[[KnownMotion, Parameters, Bools], Bools] | None = None
 
 
-MAY_BE_ZERO = ("T", "s0", "rho", "reaction", "perception", "release")  # parameters; all others must be above 0
+MAY_BE_ZERO = (
+    "T",
+    "s0",
+    "rho",
+    "reaction",
+    "perception",
+    "release",
+    "sd",
+    "margin",
+)  # parameters; all others must be above 0
 LARGEST_BRAKING_MPS2 = 0.774 * 9.81  # m/s2
 
 FREE = {"free": 2.0, "speed": 0.4, "v0": 33.3}  # speed control to v0 beyond the headway `free` (s)
@@ -201,9 +216,10 @@ LAWS: dict[str, Law] = {
         {"rho": 1.0, "a": 3.5, "b_min": 4.0, "b_max": 8.0}, _rss,
     ),
     "r157_human": Law(
-        "competent and careful human driver of UN R157", "UN R157, annex 3, and its performance model of the JRC",
+        "competent and careful human driver of UN R157",
+        "UN R157, table 1 of its performance model; programs of the JRC (release, ttc) and of esmini (others)",
         {"perception": 0.4, "reaction": 0.75, "release": 0.4, "jerk": 12.65, "most": LARGEST_BRAKING_MPS2, "front": 5.0,
-         "headway": 2.0, "ttc": 2.0}, _human, _human_notices, stays=True,
+         "headway": 2.0, "ttc": 2.0, "margin": 2.0}, _human, _human_notices,
     ),
     "r157_fsm": Law(
         "fuzzy safety model of UN R157", "Mattas et al. 2022, doi:10.1016/j.aap.2022.106743",
@@ -211,25 +227,26 @@ LAWS: dict[str, Law] = {
          "jerk": 12.65, "most": LARGEST_BRAKING_MPS2}, _fsm, _fsm_notices,
     ),
     "aeb": Law(
-        "automatic emergency braking: full braking where time to collision or required deceleration pass a limit",
-        "our own short version", {"ttc": 1.5, "required": 5.0}, _aeb,
+        "automatic emergency braking: full braking from a time to collision until rest",
+        "the AEB of esmini's UN R157; the options required and release_ttc are ours",
+        {"ttc": 1.5, "required": math.inf, "release_ttc": math.inf}, _aeb, _aeb_notices,
     ),
 }  # fmt: skip
 
 
-class Controller:
-    """Agent that follows a ``Law``.
+def within_capacities(commands_mps2: Floats, state: State, body: int) -> Floats:
+    braking, driving = state.braking_capacity_mps2, state.driving_capacity_mps2
+    return np.clip(commands_mps2, -braking[:, body - 1], driving[:, body - 1])
 
-    Memory: time at which the present danger began, [n] s: infinite without a danger, NaN before the first decision.
-    Then the reaction time begins; at the first decision, both begin at the alert. A danger ends when the law no longer
-    notices it or, if ``law.stays``, never.
-    """
+
+class Controller:
+    """Agent that reacts to what is ahead, with decisions every ``step_s``."""
 
     knows = MESSAGES
     needs_ahead = ("place", "speed", "acceleration")  # pieces of messages without which it does not drive
 
-    def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
-        self.name, self.law, self.parameters, self.step_s = name, law, Parameters(**parameters), step_s
+    def __init__(self, name: str, parameters: Mapping[str, float], step_s: float) -> None:
+        self.name, self.parameters, self.step_s = name, Parameters(**parameters), step_s
 
     def check(self, game: Game, body: int) -> None:
         """Raise ``InvalidInput`` for a game of another time step than the controller's."""
@@ -239,6 +256,19 @@ class Controller:
                 f"agent {self.name!r} was made for decisions every {self.step_s:g} s, but scenario {game.name!r} has"
                 f" one every {step_s:g} s; make it with make_agent({self.name!r}, scenario={game.name!r})"
             )
+
+
+class LawController(Controller):
+    """Agent that follows a ``Law``.
+
+    Memory: time at which the present danger began, [n] s: infinite without a danger, NaN before the first decision.
+    Then the reaction time begins; at the first decision, both begin at the alert. A danger ends when the law no longer
+    notices it.
+    """
+
+    def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
+        super().__init__(name, parameters, step_s)
+        self.law = law
 
     def begin(self, alert: State, body: int) -> Floats:
         return np.full(alert.n, np.nan)
@@ -255,41 +285,49 @@ class Controller:
         if self.law.notices is not None:
             now = np.where(np.isnan(memory), 0.0, state.time_s)
             before = np.where(np.isnan(memory), np.inf, memory)
-            gone = before if self.law.stays else np.inf
-            memory = np.where(self.law.notices(motion, p), np.minimum(before, now), gone)
+            is_noticed = self.law.notices(motion, p, before < np.inf)
+            memory = np.where(is_noticed, np.minimum(before, now), np.inf)
             elapsed, perceiving = state.time_s - memory + SAME_S, getattr(p, "perception", 0.0)
             waiting = np.where(elapsed < perceiving, 0.0, np.minimum(motion.own_mps2, -getattr(p, "release", 0.0)))
-            command = np.where(elapsed < perceiving + p.reaction, waiting, command)
-        braking, driving = state.braking_capacity_mps2, state.driving_capacity_mps2
-        return np.clip(command, -braking[:, body - 1], driving[:, body - 1]), memory
+            command = np.where(elapsed < perceiving + getattr(p, "reaction", 0.0), waiting, command)
+        return within_capacities(command, state, body), memory
 
 
-def make_controller(argument: str | None, settings: Any) -> Controller:
-    """Controller such as ``idm:T=1.0``. Raises ``UnknownName`` for an unknown parameter, ``InvalidInput`` for a bad
-    value.
+def read_parameters(argument: str | None, where: str, defaults: Mapping[str, float]) -> dict[str, float]:
+    """``defaults``, with the values of an ``argument`` such as ``T=1.0:a=2``. Raises ``UnknownName`` for an unknown
+    parameter, ``InvalidInput`` for a bad value.
     """
-    law, where = LAWS[settings.spec.partition(":")[0]], f"agent {settings.spec!r}"
     parameters: dict[str, float] = {}
     for part in [] if argument is None else argument.split(":"):
         key, _, text = part.partition("=")
-        if key not in law.parameters:
-            raise unknown_name(f"{where}: parameter", key, law.parameters)
+        if key not in defaults:
+            raise unknown_name(f"{where}: parameter", key, defaults)
         value, zero = parse_numeral(text), key in MAY_BE_ZERO
         if value is None or not (0.0 < value < math.inf or (value == 0.0 and zero)):
             raise InvalidInput(
                 f"{where}: {key} must be a finite number {'of 0 or more' if zero else 'above 0'}, for instance"
-                f" {key}={law.parameters[key]:g}"
+                f" {key}={defaults[key] if math.isfinite(defaults[key]) else 2:g}"
             )
         if key in parameters:
             raise InvalidInput(f"{where}: parameter {key} is given twice; give it once")
         parameters[key] = value
-    parameters = {**law.parameters, **parameters}
+    return {**defaults, **parameters}
+
+
+def step_of(settings: Any) -> float:
+    """Time between two decisions for which ``make_agent`` makes an agent (s)."""
+    return 0.1 if settings.scenario is None else float(settings.scenario.time_step_s)
+
+
+def make_controller(argument: str | None, settings: Any) -> LawController:
+    """Controller such as ``idm:T=1.0``."""
+    law, where = LAWS[settings.spec.partition(":")[0]], f"agent {settings.spec!r}"
+    parameters = read_parameters(argument, where, law.parameters)
     if parameters.get("b_min", 0.0) > parameters.get("b_max", math.inf):
         raise InvalidInput(
             f"{where}: b_min = {parameters['b_min']:g}: must be at most b_max, which is {parameters['b_max']:g}"
         )
-    step_s = 0.1 if settings.scenario is None else settings.scenario.time_step_s
-    return Controller(settings.spec, law, parameters, step_s)
+    return LawController(settings.spec, law, parameters, step_of(settings))
 
 
 def _entry(form: str, about: str) -> Part:
@@ -303,4 +341,4 @@ RSS = _entry("rss[:rho=1.0]", "brakes within the safe distance of RSS")
 R157_HUMAN = _entry("r157_human[:reaction=0.75]", "the careful and competent driver of UN R157")
 R157_FSM = _entry("r157_fsm[:reaction=0.75]", "the fuzzy safety model of UN R157")
 AEB = _entry("aeb[:ttc=1.5]", "automatic emergency braking")
-FIELD = [*LAWS]  # the agents of ``--agents field``
+FIELD = [*LAWS, "human"]  # the agents of ``--agents field``

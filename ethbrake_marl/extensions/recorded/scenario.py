@@ -112,8 +112,8 @@ def scenario_from_data(
     content = {key: value for key, value in base.declared().items() if key not in replaced} | {
         "name": name,
         "title": f"{entry.title}, row by row",
-        "description": f"Speeds and gaps of {rows.recordings} of {entry.title}. Brakes, masses and latencies were not"
-        f" recorded; they are as in {base.name}.",
+        "description": f"Speeds and gaps of {rows.recordings} of {entry.title}. Roads, brakes, masses and latencies"
+        f" were not recorded; they are as in {base.name}.",
         "source": f"{entry.title}, recorded in {entry.units}, folder {plain_text(folder.resolve().name)}."
         f" {'; '.join(findings)}. {entry.licence}",
         "horizon_s": max(base.horizon_s, math.ceil(at_rest_s) + 1.0),

@@ -387,7 +387,7 @@ def worlds_figure(scenario: Scenario, drawn_worlds: DrawnWorlds, *, seed: int) -
 
 
 def _varying_quantities(drawn_worlds: DrawnWorlds) -> dict[Rule, dict[int, Floats]]:
-    columns, varying = quantities_of(drawn_worlds.worlds, drawn_worlds.friction), dict[Rule, dict[int, Floats]]()
+    columns, varying = quantities_of(drawn_worlds.worlds, drawn_worlds.road), dict[Rule, dict[int, Floats]]()
     for rule in (rule for rule in QUANTITIES.values() if rule.column):
         for i in range(rule.count(drawn_worlds.worlds.vehicles)):
             values = columns.get(rule.column_of(i))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agent_names import AgentSettings, make_agent, team_of
+from ethbrake_marl.agent_names import AgentSettings, make_agent, open_game, team_of
 from ethbrake_marl.agents.e_v2x_bm import Predicting
 from ethbrake_marl.episode.counts import BUILT_IN_COUNTS, HONEST, AnyCount, HarmCount
 from ethbrake_marl.episode.game import Game
@@ -22,6 +22,7 @@ from ethbrake_marl.extensions.search.best_harm import (
     driven_profiles,
     e_v2x_bm_profiles,
 )
+from ethbrake_marl.extensions.search.in_game import GAME_CANDIDATES, search_in_game
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, have_one_objective, problem_of, with_braking
 from ethbrake_marl.extensions.search.search import search_profiles
 from ethbrake_marl.extensions.search.tables import best_stored, outdated_tables
@@ -49,24 +50,28 @@ class BestHarm(Predicting):
     If they do, the harm that happens is the memory's ``predicted_harm``, to the last bit. If it is the only learner, it
     never does more harm than E-V2X-BM and the agent of ``START``, with whose commands its search begins. Several
     learners with one objective follow the joint optimum of an ablation: the best known commands of all of them
-    together.
+    together. Where scripts react, the search plays its candidates in the game (``search_in_game``).
     """
 
     knows = MODEL
 
     def __init__(
-        self, scenario: Scenario, harm_count: AnyCount = HONEST, budget: int = SEARCH_BUDGET, name: str = "best_harm"
+        self, scenario: Scenario, harm_count: AnyCount = HONEST, budget: int | None = None, name: str = "best_harm"
     ) -> None:
-        self.name, self.scenario, self.harm_count, self.budget = name, scenario, HarmCount.of(harm_count), budget
+        """``budget``: candidates per world; None: ``SEARCH_BUDGET``, or ``GAME_CANDIDATES`` where scripts react."""
+        self.name, self.scenario, self.harm_count = name, scenario, HarmCount.of(harm_count)
+        self.budget, self.game_candidates = budget or SEARCH_BUDGET, budget or GAME_CANDIDATES
         self.last_plan: tuple[bytes, SearchMemory] | None = None  # worlds, and plan of all learners, who ask in turn
 
     def begin(self, alert: State, body: int) -> SearchMemory:
-        """Choose all commands. Raises ``InvalidInput`` if another vehicle's commands are not known at the alert."""
+        """Choose all commands. Raises ``InvalidInput`` if several learners plan jointly and a script reacts."""
         learners = self.scenario.learners
         is_joint = len(learners) > 1 and body in learners
         if is_joint and have_one_objective(alert, self.scenario.objective, learners):
             plan = self.joint_plan(alert)
             return plan._replace(commands_mps2=plan.commands_mps2[:, :, learners.index(body)])
+        if reacting_scripts(self.scenario, [body]):
+            return self.plan_in_game(alert, body)
         game, alert = single_learner_game(self.scenario, alert, body)
         problem = problem_of(game, alert, harm_count=self.harm_count, objective=self.scenario.objective)
         commands, harm = self.choose(game, alert, problem, body)
@@ -79,9 +84,22 @@ class BestHarm(Predicting):
         at = np.clip(step, 0, memory.commands_mps2.shape[1] - 1)
         return memory.commands_mps2[np.arange(state.n), at], memory
 
+    def plan_in_game(self, alert: State, body: int) -> SearchMemory:
+        scenario, game = open_game(self.scenario, [self.scenario.vehicle_names[body - 1]])
+        start = START.get(self.harm_count.name, OTHER_START)
+        commands, harm = search_in_game(
+            game, alert, candidates=self.game_candidates, harm_count=self.harm_count, objective=scenario.objective,
+            teams=[team_of(make_agent(start, scenario=scenario), scenario)],
+        )  # fmt: skip
+        return SearchMemory(commands, game.reset(alert).clock[:, FIRST_DECISION].copy(), harm)
+
     def joint_plan(self, alert: State) -> SearchMemory:
         """[n, T, L] m/s2."""
-        check_known_commands(self.scenario, self.scenario.learners)
+        for vehicle, role in reacting_scripts(self.scenario, self.scenario.learners).items():
+            raise InvalidInput(
+                f"scenario {self.scenario.name!r}: vehicle_{vehicle} is driven by {role!r}, whose commands are not"
+                " known at the alert; a joint search of several learners needs scripts that hold one command"
+            )
         game, objective = game_of(self.scenario, {}, "first-impact-harm")[1], self.scenario.objective
         problem = problem_of(game, alert, harm_count=self.harm_count, objective=objective)
         worlds = problem.identity.tobytes()
@@ -129,29 +147,25 @@ class BestHarm(Predicting):
 
 
 def single_learner_game(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
-    """Game whose only learner is vehicle ``body``, and its worlds at the alert, in which other learners brake fully.
-
-    Raises ``InvalidInput`` if another vehicle's commands are not known at the alert.
-    """
-    check_known_commands(scenario, [body])
+    """Game whose only learner is vehicle ``body``, and its worlds at the alert, in which other learners brake fully."""
     braking_learners = [learner for learner in scenario.learners if learner != body]
     alone = scenario.with_learners([scenario.vehicle_names[body - 1]])
     _, game = game_of(alone, {}, "first-impact-harm")  # the reward is not used
     return game, with_braking(alert, braking_learners)
 
 
-def check_known_commands(scenario: Scenario, bodies: Sequence[int]) -> None:
-    for vehicle, role in enumerate(scenario.roles.values(), 1):
-        if vehicle not in bodies and role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):
-            raise InvalidInput(
-                f"scenario {scenario.name!r}: vehicle_{vehicle} is driven by {role!r}, whose commands are not known at"
-                " the alert; a search needs scripts that hold one command"
-            )
+def reacting_scripts(scenario: Scenario, bodies: Sequence[int]) -> dict[int, str]:
+    """Vehicle (1: Vehicle 1) -> script, for scripts whose commands are not known at the alert; without ``bodies``."""
+    return {
+        vehicle: role
+        for vehicle, role in enumerate(scenario.roles.values(), 1)
+        if vehicle not in bodies and role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS)
+    }
 
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> BestHarm:
-    budget = SEARCH_BUDGET if argument is None else int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
-    if not 1 <= budget <= MOST_CANDIDATES:
+    budget = None if argument is None else int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
+    if budget is not None and not 1 <= budget <= MOST_CANDIDATES:
         raise InvalidInput(
             f"agent {settings.spec!r}: after the colon, give the number of profiles to try in each world, from 1 to"
             f" {MOST_CANDIDATES:,}, for instance best_harm:{SEARCH_BUDGET}"

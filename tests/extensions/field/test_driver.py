@@ -6,7 +6,7 @@ import ethbrake_marl as eb
 from tests.faces.test_driver import PAPER, drive_by_hand
 
 
-@pytest.mark.parametrize("agent", ["idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb"])
+@pytest.mark.parametrize("agent", ["idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb", "human"])
 def test_controllers__decide_alike(agent: str) -> None:
     assert drive_by_hand("paper-random-buildup", agent) == 0.0
 

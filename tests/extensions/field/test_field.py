@@ -11,6 +11,7 @@ from ethbrake_marl.episode.state import TIME
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.extensions.field.controllers import LAWS, KnownMotion, Parameters, fuzzy_criteria
 from ethbrake_marl.motion.layout import GAP
+from tests.episode.lines import state_of
 from tests.refused import refused
 
 
@@ -57,10 +58,48 @@ def test_rss__brakes_within_the_safe_distance() -> None:
     assert called("rss", [65.78, 65.79], 20, 20) == [-4.0, 0.0]
 
 
-def test_aeb__brakes_by_time_to_collision_and_required_deceleration() -> None:
-    # AEB: 10 m/s closing over 14 m is 1.4 s; 12 m/s over 19 m is 1.58 s, but asks for 144 / 38 = 3.8 m/s2.
-    assert called("aeb", [14, 16, 19, 19], [20, 20, 22, 24], 10) == [-np.inf, 0.0, 0.0, -np.inf]
-    assert called("aeb", 19, 22, 10, required=3.7) == [-np.inf]
+def test_aeb__brakes_fully_from_its_time_to_collision_until_rest() -> None:
+    # 10 m/s closing over 14 m is 1.4 s; 12 m/s over 19 m is 1.58 s, which asks for 144 / 38 = 3.8 m/s2.
+    def brakes(spec, gap, speed, front, memory=np.inf):
+        state = state_of([[gap]], [[front, speed]], braking_capacity_mps2=[6.0, 7.0])
+        return eb.make_agent(spec, scenario=TWO).act(state, np.array([memory]), 2)[0][0] == -7.0
+
+    assert brakes("aeb", 14, 20, 10) and not brakes("aeb", 16, 20, 10) and not brakes("aeb", 19, 22, 10)
+    assert brakes("aeb:required=3.7", 19, 22, 10) and not brakes("aeb:required=3.9", 19, 22, 10)
+    assert brakes("aeb", 50, 10, 20, memory=0.0)  # braking since the alert; it does not release, even at rest
+    assert brakes("aeb", 50, 0, 20, memory=0.0)
+    assert brakes("aeb:release_ttc=2", 19, 20, 10, 0.0) and not brakes("aeb:release_ttc=2", 21, 20, 10, 0.0)
+
+
+def test_aeb__does_not_let_go_in_an_episode__unless_it_may() -> None:
+    def forces_after_onset(spec):
+        forces = eb.record_episode("standards-ccrs-followed", spec, number=26, sample_s=0.1).forces_mps2[:, 1]
+        return set(forces[np.argmax(forces < 0.0) :].tolist())
+
+    assert forces_after_onset("aeb") == {-9.0} and forces_after_onset("aeb:release_ttc=1.5") == {-9.0, 0.0}
+
+
+def test_r157_driver__lets_go_again_beyond_two_seconds_and_two_metres() -> None:
+    # It brakes since 0 s: at 10 m/s it lets go beyond 2 + 2 x 10 = 22 m, and beyond 2 + 100 x 10 m with headway=100.
+    def goes_on(spec, gap, front_force=0.0):
+        state = state_of([[gap]], [[10.0, 10.0]], force_mps2=[[front_force, -5.0]])
+        clock = state.clock.copy()
+        clock[:, TIME] = 5.0
+        return eb.make_agent(spec, scenario=TWO).act(state._replace(clock=clock), np.zeros(1), 2)[0][0] < 0.0
+
+    assert goes_on("r157_human", 21.9) and not goes_on("r157_human", 22.1)
+    assert goes_on("r157_human:front=0.5:headway=100", 1001) and not goes_on("r157_human:front=0.5:headway=100", 1003)
+
+
+def test_fuzzy_model__does_not_let_go_in_contact() -> None:
+    # At 10 m/s, 0.5 m ahead, 20 + 10.7 m would be safe: it brakes with its 4 m/s2, though the gap does not close.
+    state = state_of([[0.5]], [[10.0, 10.0]], force_mps2=[[0.0, -4.0]])
+    agent = eb.make_agent("r157_fsm", scenario=TWO)
+    clock = state.clock.copy()
+    clock[:, TIME] = 5.0
+    state = state._replace(clock=clock)
+    assert agent.act(state, np.zeros(1), 2)[0].tolist() == [-4.0]
+    assert agent.act(state, np.full(1, np.inf), 2)[0].tolist() == [0.0]  # such a danger does not begin
 
 
 def test_fuzzy_model__by_hand() -> None:
@@ -92,7 +131,10 @@ def test_un_r157__reacts_eases_off_and_brakes_with_a_jerk() -> None:
 
 @pytest.mark.parametrize(
     ("spec", "command"),
-    [("idm", 0.478), ("acc", 1.32), ("cacc", 1.32), ("rss", 0), ("r157_human", 0), ("r157_fsm", 0), ("aeb", 0)],
+    [
+        *[("idm", 0.478), ("acc", 1.32), ("cacc", 1.32), ("rss", 0), ("r157_human", 0), ("r157_fsm", 0)],
+        *[("aeb", 0), ("human", 0)],
+    ],
 )
 def test_vehicle_1__brakes_for_nothing_without_an_obstacle(spec: str, command: float) -> None:
     worlds, agent = TWO.sample(1, 7), eb.make_agent(spec, scenario=TWO)
@@ -168,16 +210,16 @@ def test_agent__whose_messages_lack_a_piece_is_refused_unless_it_sees_the_vehicl
     assert harms[0] == harms[1] and harms[0][0] > 0.0
 
 
-GOLDEN = {  # mean first-impact harm of 50 worlds, seed 7, recorded from version 0.5
-    "paper-random": [16.1551, 42.095, 16.8336, 40.1944, 61.0173, 42.2942, 13.8795],
-    "cooperation-2-blocked": [27.7127, 45.6304, 28.4767, 45.7241, 66.1125, 45.5764, 21.8598],
+GOLDEN = {  # mean first-impact harm of 50 worlds, seed 7; of idm, acc, cacc and rss recorded from version 0.5
+    "paper-random": [16.1551, 42.095, 16.8336, 40.1944, 61.0173, 43.0834, 19.5251, 80.9137],
+    "cooperation-2-blocked": [27.7127, 45.6304, 28.4767, 45.7241, 65.9715, 46.4936, 30.4407, 85.5706],
 }
 
 
 @pytest.mark.parametrize("scenario", GOLDEN)
-def test_field__has_the_harm_of_version_0_5(scenario: str) -> None:
+def test_field__has_the_recorded_harm(scenario: str) -> None:
     result = eb.evaluate(scenario, "field", episodes=50)
-    assert [*result.columns] == group("field") == [*LAWS]
+    assert [*result.columns] == group("field") == [*LAWS, "human"]
     assert [round(float(each["first_impact_harm"].mean()), 4) for each in result.columns.values()] == GOLDEN[scenario]
 
 

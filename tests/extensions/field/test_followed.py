@@ -5,7 +5,7 @@ import pytest
 
 import ethbrake_marl as eb
 
-REACTION_S = 1.25  # perception 0.5 s, reaction 0.75 s
+REACTION_S = 1.25
 TESTS = ("ccrs", "ccrm-2026", "ccrb-2026", "fmvss-127", "r157")
 
 
@@ -25,7 +25,10 @@ def test_followed__has_the_rows_of_the_test_and_time_gaps_behind(test: str) -> N
 @pytest.mark.parametrize(("agent", "brakes_at_s"), [("full_brake", 0.2), ("coast", np.inf)])
 def test_human__brakes_so_long_after_vehicle_2_slows__and_not_by_a_clock(agent: str, brakes_at_s: float) -> None:
     scenario = eb.load_scenario("standards-ccrb-2026-followed")
-    calm = scenario.replace(table=None, gaps_m=[400, 60], speeds_mps=[30, 20, 20], braking_capacity_mps2=[4, 9, 6])
+    roles = {**scenario.roles, "vehicle_3": f"human:reaction={REACTION_S}:sd=0"}
+    calm = scenario.replace(
+        table=None, gaps_m=[400, 60], speeds_mps=[30, 20, 20], braking_capacity_mps2=[4, 9, 6], roles=roles
+    )
     record = eb.record_episode(calm, agent, sample_s=0.1)
     until = record.time_s < 6.0
     brakes = record.forces_mps2[until, 2] < -1.0
@@ -36,5 +39,7 @@ def test_human__brakes_so_long_after_vehicle_2_slows__and_not_by_a_clock(agent: 
 
 
 def test_who_brakes_hard_is_struck__who_brakes_early_is_not() -> None:
-    costs = eb.evaluate("standards-fmvss-127-followed", "full_brake,idm", episodes=60)
-    assert costs["full_brake"]["collided"].all() and not costs["idm"]["collided"].any()
+    costs = eb.evaluate("standards-fmvss-127-followed", "full_brake,idm", episodes=200)
+    struck = {agent: columns["collided"].mean() for agent, columns in costs.columns.items()}
+    assert struck["full_brake"] > 0.8 and struck["idm"] < 0.2
+    assert costs["full_brake"]["honest_cost"].mean() > 10.0 * costs["idm"]["honest_cost"].mean()

@@ -168,7 +168,9 @@ def drive(scenario: eb.Scenario | str, agent: str, **options: object) -> Callabl
     return lambda: eb.evaluate(scenario, agent, episodes=3, **options)
 
 
-PLANS = KEPT.replace(roles={"vehicle_2": "learner", "vehicle_3": "ppo"})
+JOINT = eb.load_scenario("cooperation-3-pair").replace(
+    roles={"vehicle_1": "ppo", "vehicle_2": "learner", "vehicle_3": "learner"}, early_impacts="keep"
+)
 NO_TABLE = (
     "measures limits: scenario 'realistic-platoon' has no table of best known harm; evaluate the agent best_harm"
     " beside yours"
@@ -180,7 +182,7 @@ OTHER_WORLDS = (
 REFUSED: dict[str, Callable[[], object]] = {
     "agent 'best_harm:1.5': after the colon, give the number of profiles": drive(PAPER, "best_harm:1.5"),
     "unknown shield 'search'; known: ": drive(PAPER, "full_brake+search"),
-    "vehicle_3 is driven by 'ppo', whose commands are not known at the alert": drive(PLANS, "best_harm"),
+    "vehicle_1 is driven by 'ppo', whose commands are not known at the alert; a joint": drive(JOINT, "best_harm"),
     OTHER_WORLDS: drive(PAPER, "coast", seed=8, measures="limits"),
     NO_TABLE: drive("realistic-platoon", "coast", measures="limits"),
 }
