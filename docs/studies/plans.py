@@ -21,9 +21,9 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.agent_names import make_teams
 from ethbrake_marl.agents.team import Team, play_to_end
-from ethbrake_marl.episode.plans import COMMANDS
+from ethbrake_marl.episode.plans import COMMANDS, no_plans
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.extensions.forecasts.planner import Planner, foresee, make_plans, no_plans
+from ethbrake_marl.extensions.forecasts.planner import Planner, foresee, make_plans
 
 ONE = ("paper-random", "paper-random-obstacle", "realistic-truck", "benchmark-truck", "stress-wide")
 SEVERAL = (

@@ -28,6 +28,11 @@ class PlanMemory(NamedTuple):
     begun_s: Floats  # [n] when it began to brake (s after the alert); infinite: not yet
 
 
+def no_plans(state: State) -> Floats:
+    """Plans of bodies that have none, [n, PLAN_NUMBERS, N + 1]."""
+    return np.full((state.n, PLAN_NUMBERS, state.vehicles + 1), np.nan)
+
+
 def are_plans(plan: Floats) -> Bools:
     """Whether each row of ``plan`` is a plan, or only NaN, [n]."""
     if plan.shape[1:] != (PLAN_NUMBERS,) or plan.dtype.kind not in "fiu":
@@ -39,7 +44,7 @@ def are_plans(plan: Floats) -> Bools:
 
 def plans_of(state: State) -> Floats:
     """Plans of all bodies, [n, PLAN_NUMBERS, N + 1], with commands within their capacities."""
-    plans = np.full((state.n, PLAN_NUMBERS, state.vehicles + 1), np.nan)
+    plans = no_plans(state)
     for body, memory in state.memories.items():
         if isinstance(memory, PlanMemory):
             plans[:, :, body] = memory.plan

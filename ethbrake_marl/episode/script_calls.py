@@ -97,9 +97,7 @@ def name_of(script: Any) -> str:
 
 def begin_script(script: Any, alert: State, body: int) -> Any:
     """Memory of a script at the ``alert`` of new episodes. Raises ``AgentFailed`` if the script fails."""
-    memory = _call(script, "begin", alert, body)
-    _check_plan(script, memory, body)
-    return memory
+    return _checked(script, _call(script, "begin", alert, body), body)
 
 
 def ask_script(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
@@ -108,7 +106,6 @@ def ask_script(script: Any, state: State, memory: Any, body: int) -> tuple[Float
     Raises ``AgentFailed`` if the script fails, or if its commands are not numbers or exceed a capacity.
     """
     answer, memory = _call(script, "act", state, memory, body)
-    _check_plan(script, memory, body)
     try:
         commands = np.asarray(answer)
     except ValueError:  # lists of different lengths
@@ -128,7 +125,7 @@ def ask_script(script: Any, state: State, memory: Any, body: int) -> tuple[Float
             f"vehicle_{body} at {state.time_s[k]:.2f} s: command {commands[k]:g} m/s2; must be in"
             f" [{low[k]:g}, {high[k]:g}] m/s2",
         )
-    return commands, memory
+    return commands, _checked(script, memory, body)
 
 
 def ask_scripts(scripts: Mapping[int, Any], state: State) -> State:
@@ -141,12 +138,13 @@ def ask_scripts(scripts: Mapping[int, Any], state: State) -> State:
     return state._replace(wanted=wanted, memories=memories)
 
 
-def _check_plan(script: Any, memory: Any, body: int) -> None:
-    """Raise ``AgentFailed`` if a script tells what is no plan."""
+def _checked(script: Any, memory: Any, body: int) -> Any:
+    """The ``memory``. Raises ``AgentFailed`` if a script tells what is no plan."""
     if isinstance(memory, PlanMemory) and not (good := are_plans(memory.plan)).all():
         right = f"must be {PHASES - 1} times in order, then {PHASES} finite commands; or only NaN, if there is no plan"
         told = memory.plan[np.argmin(good)].tolist()
         raise AgentFailed(name_of(script), None, f"vehicle_{body}: tells the plan {told}; {right}")
+    return memory
 
 
 def _call(script: Any, method: str, state: State, *arguments: Any) -> Any:

@@ -69,7 +69,7 @@ class StepShieldMemory(NamedTuple):
     first: Floats  # [n] B, price at the alert (m2/s2)
     caps: Floats | None  # [n, N] harm that each vehicle may bear (m2/s2)
     settles: Bools  # [n] whether all vehicles come to rest under the plan of the alert
-    agents: tuple[Any, ...]  # memory of each agent of the shield's own team
+    agents: Mapping[int, Any]  # memory of each agent of the shield's own team
     proposed: Floats  # [n, L] last proposals; NaN: none
     applied: Floats  # [n, L] last actions
     reason: Ints  # [n, L] `ShieldReason` of each last action
@@ -176,7 +176,7 @@ class StepShield:
         settles: Bools = (last.line[:, SPEED] == 0.0).all(axis=1) & (last.line[:, FORCE] <= 0.0).all(axis=1)
         nothing = np.zeros((state.n, len(game.settings.learners)))
         return StepShieldMemory(
-            plan, harm, harm.copy(), caps, settles, tuple(agents.values()), nothing, nothing,
+            plan, harm, harm.copy(), caps, settles, agents, nothing, nothing,
             np.full(nothing.shape, NO_DECISION), nothing, np.zeros((state.n, state.vehicles), np.bool_),
             np.zeros(state.n, np.int64),
         )  # fmt: skip
@@ -221,7 +221,7 @@ class StepShield:
         applied = memory.plan[worlds, decision]
         differ = running & (applied != proposed)
         return applied, memory._replace(
-            agents=tuple(state.memories[AGENTS].values()), proposed=proposed, applied=applied,
+            agents=state.memories[AGENTS], proposed=proposed, applied=applied,
             intervened=spread(game, state, differ, False), replaced=memory.replaced + differ.sum(axis=1), reason=reason,
             margin=margin,
         )  # fmt: skip
@@ -233,7 +233,7 @@ class StepShield:
         memory up to date.
         """
         memories = {who: memory for who, memory in state.memories.items() if who != "shield"}
-        agent_memories = dict(zip(self.drivers, state.memories["shield"].agents, strict=True))
+        agent_memories = state.memories["shield"].agents
         if proposed is None:
             if not agent_memories:
                 raise InvalidInput("step: actions = None: this shield has no agents that could propose any")
@@ -297,9 +297,8 @@ class StepShield:
 
     def measures(self, game: Game, last: State) -> dict[str, Any]:
         memory: StepShieldMemory = last.memories["shield"]
-        memories = dict(zip(self.drivers, memory.agents, strict=True))
         replaced = {"actions": memory.replaced, "none": memory.replaced == 0}
-        return {"replaced": replaced, **report_of(self.drivers, last, memories)}
+        return {"replaced": replaced, **report_of(self.drivers, last, memory.agents)}
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
         memory: StepShieldMemory = state.memories["shield"]

@@ -277,7 +277,7 @@ def test_an_agent_that_remembers_is_asked_once_at_every_decision(outside: bool) 
     state = game.reset(scenario.sample(4, 7))
     for k in range(5):
         state, _ = game.step(state, np.full((4, 1), -0.5) if outside else None)
-        assert (state.memories["shield"].agents[0] == k + 1.0).all()
+        assert (state.memories["shield"].agents[2] == k + 1.0).all()
     if not outside:
         np.testing.assert_allclose(state.memories["shield"].proposed, -4 / 60)
 

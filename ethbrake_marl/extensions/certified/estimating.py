@@ -13,12 +13,12 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import HONEST, HarmCount
 from ethbrake_marl.episode.layer import ESTIMATED, Observer, see_through
-from ethbrake_marl.episode.plans import COMMANDS, PHASES, PLAN_NUMBERS
+from ethbrake_marl.episode.plans import COMMANDS, PHASES, PLAN_NUMBERS, no_plans
 from ethbrake_marl.episode.state import TIME, State
 from ethbrake_marl.episode.step import hold_commands
 from ethbrake_marl.extensions.certified.estimated import News, PossibleLines, check_predictable
 from ethbrake_marl.extensions.forecasts.phases import Forecast, empty_forecast
-from ethbrake_marl.extensions.forecasts.planner import make_plans, no_plans
+from ethbrake_marl.extensions.forecasts.planner import make_plans
 from ethbrake_marl.extensions.messages.game import MessagesLayer
 from ethbrake_marl.extensions.messages.links import SAMPLE_FORCE
 from ethbrake_marl.motion.layout import FORCE, GAP, HIT, LATENCY, SPEED, Floats

@@ -7,10 +7,10 @@ import numpy as np
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.counts import HONEST
 from ethbrake_marl.episode.features import Feature
-from ethbrake_marl.episode.plans import CHANGES, COMMANDS, PHASES
+from ethbrake_marl.episode.plans import CHANGES, COMMANDS, PHASES, no_plans
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.forecasts.phases import HIGH_TIE, LOW_TIE, OF_BRAKING, OF_CONSTANT, OF_PLAN
-from ethbrake_marl.extensions.forecasts.planner import foresee, make_plans, no_plans
+from ethbrake_marl.extensions.forecasts.planner import foresee, make_plans
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.registry import Part
 

@@ -17,7 +17,7 @@ from ethbrake_marl.episode.counts import HONEST, HarmCount
 from ethbrake_marl.episode.departures import SHOWN
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MESSAGES, Observer
-from ethbrake_marl.episode.plans import COMMANDS, PHASES, PLAN_NUMBERS, PLANS_KEY, PlanMemory
+from ethbrake_marl.episode.plans import COMMANDS, PHASES, PLAN_NUMBERS, PLANS_KEY, PlanMemory, no_plans
 from ethbrake_marl.episode.state import State, require
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.extensions.forecasts.contacts import FORECAST_S
@@ -71,10 +71,6 @@ class Planner(Observer):
             candidates=self.candidates,
         )  # fmt: skip
         return plans[:, COMMANDS.start, body].copy(), PlanMemory(plans[:, :, body], begun_s)
-
-
-def no_plans(state: State) -> Floats:
-    return np.full((state.n, PLAN_NUMBERS, state.vehicles + 1), np.nan)
 
 
 def writable(*arrays: Floats) -> list[Floats]:

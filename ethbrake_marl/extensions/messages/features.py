@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from ethbrake_marl.episode.plans import CHANGES, COMMANDS, PHASES, PLAN_NUMBERS, PLANS_KEY
+from ethbrake_marl.episode.plans import CHANGES, COMMANDS, PHASES, PLANS_KEY, no_plans
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.messages.belief import ages_s, known_pieces
 from ethbrake_marl.extensions.messages.links import MESSAGES_KEY, PIECES
@@ -57,10 +57,7 @@ def _plan_change(phase: int) -> Part:
 
 
 def _plan_of(state: State, neighbour: int) -> Floats:
-    if PLANS_KEY not in state.memories:
-        return np.full((state.n, PLAN_NUMBERS), np.nan)
-    plan: Floats = state.memories[PLANS_KEY][:, :, neighbour]
-    return plan
+    return np.asarray(state.memories.get(PLANS_KEY, no_plans(state))[:, :, neighbour])
 
 
 def _of_neighbour(function: Callable[..., Floats], unit: str, scale: float, low: float, high: float) -> Part:
