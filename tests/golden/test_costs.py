@@ -16,7 +16,7 @@ COSTS = {  # who drives: full braking is pushed by weaker brakes; who coasts pus
     ("paper-random-buildup", "coast"): (429.356088, 381.177386),
     ("benchmark-truck", "full_brake"): (67.8212755, 47.5234638),
     ("cooperation-3-five", "coast"): (1574.43402, 604.468758),
-    ("realistic-mixed", "coast"): (719.963551, 478.939095),
+    ("realistic-mixed", "coast"): (680.535677, 454.971444),
     ("standards-ccrm-2026", "coast"): (520.640975, 281.501251),
     ("stress-wide", "coast"): (772.562275, 614.640643),
 }
