@@ -198,7 +198,7 @@ def played(physics: Any, *specs: str, measures: str = "", worlds: State | None =
 
 def test_physics__changes_what_happens_and_nothing_predicts_it() -> None:
     """The bound was stored for the same worlds in the plain game, where it holds."""
-    measures = [name for name in ("proven_harm", "avoidable") if name in MEASURES]
+    measures = [name for name in ("proven_harm", "contact_avoidable") if name in MEASURES]
     plain = played(None, "full_brake", "e_v2x_bm:pairwise", measures=",".join(measures))
     ice = played(Ice(), "full_brake")["full_brake"]["total_harm"]
     assert (abs(ice - plain["full_brake"]["total_harm"]) > 1.0).mean() > 0.3
@@ -220,7 +220,7 @@ def test_physics__changes_what_happens_and_nothing_predicts_it() -> None:
 
 def test_exact_physics__keeps_everything() -> None:
     specs = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "coast+step"]
-    measures = ",".join(name for name in ("pushed_m", "avoidable", "proven_harm") if name in MEASURES)
+    measures = ",".join(name for name in ("pushed_m", "contact_avoidable", "proven_harm") if name in MEASURES)
     plain, exact = (played(physics, *specs, measures=measures) for physics in (None, Exact()))
     for spec in specs:
         assert {*plain[spec]} == {*exact[spec]} >= {"honest_cost"}
@@ -248,7 +248,7 @@ def test_quantity__that_a_feature_does_not_know_is_refused_and_simulations_go_on
         if spec.partition(":")[0] in AGENTS:
             with refused("does not cover ice, by which world 0 departs"):
                 played(None, spec, worlds=icy)
-    for name in ("proven_harm", "avoidable", "best_known"):
+    for name in ("proven_harm", "contact_avoidable", "best_known"):
         if name in measure_names():
             with refused("does not cover ice, by which world 0 departs"):
                 played(None, "coast", worlds=icy, measures=name)

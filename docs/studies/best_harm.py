@@ -26,7 +26,7 @@ from ethbrake_marl.episode.counts import COUNTS, IMPACT_COUNTS, HarmCount
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.extensions.proofs.measures import avoidable, proven_harm
+from ethbrake_marl.extensions.proofs.measures import contact_avoidable, proven_harm
 from ethbrake_marl.extensions.search.best_harm import SEARCH_BUDGET, search_list
 from ethbrake_marl.extensions.search.pricing import best_of, problem_of
 from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable, outdated_tables, shipped_tables
@@ -181,7 +181,7 @@ def difference(table: BestHarmTable) -> str:
 def proven(game: Game, alert: State, first: Floats, total: Floats) -> list[Any]:
     """Mean proven harm, rates of proven contact and impact, and of worlds between; and what is known there."""
     try:
-        bound, verdict = proven_harm(game, alert, alert), avoidable(game, alert, alert)
+        bound, verdict = proven_harm(game, alert, alert), contact_avoidable(game, alert, alert)
     except InvalidInput:
         return [None] * 6
     assert isinstance(bound, dict) and isinstance(verdict, dict)

@@ -2,10 +2,10 @@
 
     .venv/bin/python docs/studies/paper/latency.py docs/figures/latency.png
 
-The least collision rate and the least harm of every strategy in the paper's random test, over the latencies of
-Vehicles 2 and 3: whether a collision is unavoidable is proven in closed form (measure ``avoidable``); the harm is the
-proven lower bound (``proven_harm``). Vehicle 2 acts first. Worlds in which it collides before it may act are drawn
-again, as in the paper. Prints both tables.
+The least contact rate and the least harm of every strategy in the paper's random test, over the latencies of Vehicles
+2 and 3: whether contact is unavoidable is proven in closed form (measure ``contact_avoidable``); the harm is the proven
+lower bound (``proven_harm``). Vehicle 2 acts first. Worlds in which it collides before it may act are drawn again, as
+in the paper. Prints both tables.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ REAR_S = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
 def least(acts_s: float, rear_s: float) -> tuple[float, float]:
-    """Least collision rate (%) and least mean harm (m2/s2); NaN if Vehicle 2 would act after Vehicle 3."""
+    """Least contact rate (%) and least mean harm (m2/s2); NaN if Vehicle 2 would act after Vehicle 3."""
     if acts_s > rear_s:
         return np.nan, np.nan
     scenario = eb.load_scenario("paper-random").replace(latency_s=[0.0, acts_s, rear_s])
@@ -41,7 +41,7 @@ def least(acts_s: float, rear_s: float) -> tuple[float, float]:
 def draw(rates: np.ndarray, harms: np.ndarray) -> Figure:
     """``rates`` (%) and ``harms`` (m2/s2): [ACTS_S, REAR_S]."""
     figure, panels = new_panels((10.0, 4.4), columns=2)
-    titles = "least collision rate (%)", "least harm (m²/s²)"
+    titles = "least contact rate (%)", "least harm (m²/s²)"
     for axes, table, title, digits in zip(panels, (rates, harms), titles, (0, 1), strict=True):
         axes.grid(visible=False)
         axes.imshow(table, cmap="YlOrRd", origin="lower", aspect="auto")
@@ -60,7 +60,7 @@ def main() -> None:
     parser.add_argument("picture", type=Path)
     picture = parser.parse_args().picture
     table = np.array([[least(acts_s, rear_s) for rear_s in REAR_S] for acts_s in ACTS_S])
-    for k, what in enumerate(("least collision rate (%)", "least harm (m2/s2)")):
+    for k, what in enumerate(("least contact rate (%)", "least harm (m2/s2)")):
         print(f"{what}; rows: Vehicle 2 at {ACTS_S}, columns: Vehicle 3 at {REAR_S}")
         print("\n".join(" ".join(f"{value:6.2f}" for value in row) for row in table[:, :, k]))
     write_picture(picture, draw(table[:, :, 0], table[:, :, 1]), force=True)

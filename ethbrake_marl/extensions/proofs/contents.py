@@ -1,3 +1,3 @@
 """Contents of this extension: group -> name -> module of this folder and object."""
 
-CONTENTS = {"measures": {"avoidable": "measures:AVOIDABLE", "proven_harm": "measures:PROVEN_HARM"}}
+CONTENTS = {"measures": {"contact_avoidable": "measures:CONTACT_AVOIDABLE", "proven_harm": "measures:PROVEN_HARM"}}

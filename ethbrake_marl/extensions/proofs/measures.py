@@ -1,4 +1,4 @@
-"""The measures ``avoidable`` and ``proven_harm``: what the proofs say of each world.
+"""The measures ``contact_avoidable`` and ``proven_harm``: what the proofs say of each world.
 
 They are computed only on request, because a proof is slow.
 """
@@ -19,7 +19,7 @@ from ethbrake_marl.motion.layout import BRAKING
 from ethbrake_marl.registry import Part
 
 
-def avoidable(game: Game, alert: State, last: State) -> MeasureValue:
+def contact_avoidable(game: Game, alert: State, last: State) -> MeasureValue:
     """Whether some commands avoid all contact (proven), and if not, why: ``early``, ``front`` or ``rear``.
 
     The proof covers lines of three vehicles in which Vehicle 2 learns, or Vehicles 2 and 3, and lines of two vehicles
@@ -65,15 +65,18 @@ def _controlled_body(game: Game, alert: State, *, together: bool = False) -> int
     scripted_bodies = [body for body in range(1, alert.vehicles + 1) if body not in learners]
     if game.scripts or (alert.wanted[:, scripted_bodies] != -capacities(alert.car, BRAKING)[:, scripted_bodies]).any():
         raise InvalidInput(
-            "avoidable, proven_harm: a vehicle that does not learn does not brake fully; all others must"
+            "contact_avoidable, proven_harm: a vehicle that does not learn does not brake fully; all others must"
         )
     if len(learners) != 1 and not (together and learners == [2, 3]):
         names = ", ".join(f"vehicle_{body}" for body in learners)
-        raise InvalidInput(f"avoidable, proven_harm: {names} learn; the proofs cover one controlled vehicle")
+        raise InvalidInput(f"contact_avoidable, proven_harm: {names} learn; the proofs cover one controlled vehicle")
     return int(learners[0])
 
 
-AVOIDABLE = Part(avoidable, statistics=(Statistic("avoidable_rate", "rate", "Avoidable", "Avoid-\nable"),))
+CONTACT_AVOIDABLE = Part(
+    contact_avoidable,
+    statistics=(Statistic("contact_avoidable_rate", "rate", "Contact avoidable", "Contact\navoidable"),),
+)
 PROVEN_HARM = Part(
     proven_harm, unit="m2/s2",
     statistics=(

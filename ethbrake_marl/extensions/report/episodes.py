@@ -146,9 +146,9 @@ def shown_worlds(compared: Comparison, focus: str) -> dict[int, str]:
         chosen.update(dict.fromkeys(fresh[: min(most, MOST_WORLDS - len(chosen))], kind))
 
     add(f"Where {focus} did worst", worst_rows(compared, focus), WORST_WORLDS)
-    if best_known is not None and best_known.avoidable is not None:
-        avoidable = result[focus]["collided"] & best_known.avoidable
-        add(f"Avoidable, and {focus} collided", rows_by_value(cost, avoidable))
+    if best_known is not None and best_known.contact_avoidable is not None:
+        needless = result[focus]["collided"] & best_known.contact_avoidable
+        add(f"Contact was avoidable, and {focus} collided", rows_by_value(cost, needless))
     if BASELINE in result.columns and focus != BASELINE:
         saved = result[BASELINE][column] - cost
         add(f"Where {focus} saved most against {BASELINE}", rows_by_value(saved, saved > 0.0))

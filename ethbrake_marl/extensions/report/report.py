@@ -196,8 +196,8 @@ def worst_section(compared: Comparison, focus: str, watched: Collection[int]) ->
     columns = {count.words.capitalize(): result[focus][count.column] for count in counts}
     if known_best is not None:
         columns |= {f"Best known, {count.name}": known_best.harm[count] for count in counts if count in known_best.harm}
-        if known_best.unavoidable is not None:
-            columns["An impact is"] = np.where(known_best.unavoidable, "unavoidable", "perhaps avoidable")
+        if known_best.impact_unavoidable is not None:
+            columns["An impact is"] = np.where(known_best.impact_unavoidable, "unavoidable", "perhaps avoidable")
     columns["Impacts"] = result[focus]["impacts"]
     rows = []
     for k in worst_rows(compared, focus):
@@ -220,13 +220,14 @@ def avoidable_section(compared: Comparison) -> Section:
         words = "For each harm x: share of the worlds in which an agent did more harm than x."
         return Section("World by world", [drawing(figure, "Harm", words)])
     body: list[str] = []
-    if best_known.unavoidable is not None:
-        share = rate(best_known.unavoidable, result.clusters).in_words(digits=1, scale=100.0, unit=" %")
+    certain = best_known.impact_unavoidable
+    if certain is not None:
+        share = rate(certain, result.clusters).in_words(digits=1, scale=100.0, unit=" %")
         body.append(
             f"An impact is unavoidable in {share} of the worlds: it is proven for each of them that no command avoids"
             " an impact."
         )
-        for where, among in (("Impact unavoidable", best_known.unavoidable), ("Other worlds", ~best_known.unavoidable)):
+        for where, among in (("Impact unavoidable", certain), ("Other worlds", ~certain)):
             if among.any():
                 body.append(table(_harm_among(compared, best_known, where, among)))
     words = "For each value x: share of the worlds in which an agent's harm minus the best known harm is above x."

@@ -98,11 +98,17 @@ def algorithm_1(policy: Outcome, baseline: Outcome, bound: Floats) -> Outcome:
     return {key: np.where(follows, policy[key], baseline[key]) for key in policy}
 
 
-def unavoidable(reading: Reading, episodes: int) -> Bools:
-    """Whether every strategy collides, for exact impacts: proven in closed form, [n]."""
+def contact_unavoidable(reading: Reading, episodes: int) -> Bools:
+    """Whether every strategy has contact, perhaps without an impact: proven in closed form, [n]."""
     return ~avoidability(open_reading(reading, episodes)[2], VEHICLE_2).avoidable
 
 
+def impact_unavoidable(reading: Reading, episodes: int) -> Bools:
+    """Whether it is proven that every strategy has an impact, which is a collision, for exact impacts, [n]."""
+    return proven_least_harm(reading, episodes) > 0.0
+
+
+@cache
 def proven_least_harm(reading: Reading, episodes: int) -> Floats:
     """Proven lower bound on the harm of every strategy if impacts are exact and each pair counts, [n] m2/s2."""
     scenario, _, alert = open_reading(reading, episodes)

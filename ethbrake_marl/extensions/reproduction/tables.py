@@ -30,12 +30,13 @@ from ethbrake_marl.extensions.reproduction.strategies import (
     VEHICLE_2,
     Outcomes,
     avoided_text,
+    contact_unavoidable,
     drive,
+    impact_unavoidable,
     open_reading,
     proven_least_harm,
     strategies,
     times_above,
-    unavoidable,
 )
 from ethbrake_marl.extensions.reproduction.verdicts import (
     HARM,
@@ -66,7 +67,7 @@ def number_claims(row: PaperRow, outcomes: Mapping[str, Outcomes], bounds: Mappi
     ``outcomes``: reading -> strategy -> outcome. ``bounds``: ``least_rates``.
     """
     rates, harms = {}, {}
-    bound = f"; at least {PERCENT.show(bounds[EXACT]).in_words}, whoever drives"
+    bound = f"; {at_least(bounds)}"
     for reading, driven in outcomes.items():
         collided, harm = rate(driven[row.agent]["collided"]), mean(driven[row.agent]["first"])
         verdict, text = judge_number(row.collision_rate, collided), PERCENT.show(collided).in_words
@@ -77,6 +78,10 @@ def number_claims(row: PaperRow, outcomes: Mapping[str, Outcomes], bounds: Mappi
     return [Claim(f"{row.agent}, collision rate", rates), Claim(f"{row.agent}, average harm", harms)]
 
 
+def at_least(bounds: Mapping[str, Estimate]) -> str:
+    return f"at least {PERCENT.show(bounds[EXACT]).in_words} with an impact, whoever drives"
+
+
 def is_excluded(printed: float, bounds: Mapping[str, Estimate]) -> bool:
     """Whether a collision rate cannot be for exact impacts, and not in the map with any of its steps."""
     return all(judge_number(printed, bound, bound) == "cannot be" for bound in bounds.values())
@@ -85,20 +90,21 @@ def is_excluded(printed: float, bounds: Mapping[str, Estimate]) -> bool:
 def least_rates(episodes: int) -> dict[str, Estimate]:
     """Least collision rates: physics in words -> rate, for exact impacts and for steps of the paper's map.
 
-    A rate in the map is that of exact impacts in all worlds, plus the difference between map and exact impacts in the
-    first worlds: both collide in nearly the same worlds.
+    In the map a contact at a sample is a collision, as in the paper. Its rate is that of contact in all worlds, plus
+    the difference between map and contact in the first worlds: both happen in nearly the same worlds.
     """
-    certain, few = unavoidable(STATED, episodes).astype(np.float64), min(MAP_WORLDS, episodes)
-    rates = {EXACT: rate(certain > 0.0)}
+    contact, few = contact_unavoidable(STATED, episodes).astype(np.float64), min(MAP_WORLDS, episodes)
+    rates = {EXACT: rate(impact_unavoidable(STATED, episodes))}
     for step_s in MAP_STEPS_S:
         in_map = collides_in_map(STATED._replace(step_s=step_s), few)
-        rates[f"map, steps of {step_s:g} s"] = unpaired_difference(mean(certain), mean(certain[:few] - in_map))
+        rates[f"map, steps of {step_s:g} s"] = unpaired_difference(mean(contact), mean(contact[:few] - in_map))
     return rates
 
 
 def rates_sheet(rates: Mapping[str, Estimate]) -> Sheet:
     note = (
-        f"Exact impacts: closed form. Map: plus its difference from exact impacts in the first {MAP_WORLDS:,} worlds."
+        "Exact impacts: worlds in which an impact is proven. Map: contact at a sample; that of exact motion, plus its"
+        f" difference in the first {MAP_WORLDS:,} worlds."
     )
     return Sheet("Least collision rate of every strategy", ("Impacts", PERCENT), [*rates.items()], note)
 
@@ -167,7 +173,7 @@ def conclusions(outcomes: Outcomes) -> dict[str, list[Less]]:
 
 
 def severity(outcomes: Outcomes, certain: Bools) -> list[Less]:
-    """Policies do less harm than E-V2X-BM where a collision is ``certain``, [n]."""
+    """Policies do less harm than E-V2X-BM where an impact is ``certain``, [n]."""
     return [
         Less.of_worlds(
             f"{name} minus {E_V2X_BM}", outcomes[name]["first"][certain], outcomes[E_V2X_BM]["first"][certain]
@@ -201,13 +207,17 @@ def world_claims(of_reading: Mapping[str, Outcomes]) -> list[Claim]:
     return [Claim("expected is overall", overall), Claim("safety bound", safe), Claim("never worse", better)]
 
 
-def avoidance_claims(outcomes: Outcomes, certain: Bools) -> list[Claim]:
-    """Who collides where a collision is not ``certain``, [n]. The same in every reading."""
+def avoidance_claims(outcomes: Outcomes, contact: Bools, impact: Bools) -> list[Claim]:
+    """Who collides where ``contact`` is not certain, and at most where an ``impact`` is not, [n]; the same in every
+    reading.
+    """
     claims = []
     for name in (NON_E, E_V2X_BM):
-        needless = outcomes[name]["collided"] & ~certain
+        collided = outcomes[name]["collided"]
+        needless, most = collided & ~contact, collided & ~impact
         share = PERCENT.show(rate(needless)).in_words
-        text = f"in {share} of all worlds ({needless.sum():,} of its {outcomes[name]['collided'].sum():,} collisions)"
+        of_all = f"{needless.sum():,} to {most.sum():,} of its {collided.sum():,} collisions"
+        text = f"at least in {share} of all worlds ({of_all})"
         verdict: Verdict = "agrees" if needless.any() else "differs"
         claims.append(same_claim(f"{name}'s avoidable collisions", text, verdict, PERCENT.show(needless.mean()).value))
     for name in SHIPPED_SPECS:
@@ -268,16 +278,18 @@ def reproduce_random_table(settings: ReproductionSettings) -> Made:
     """Table III (``Table:Random``)."""
     episodes = settings.episodes
     outcomes = strategies(STATED, episodes, SHIPPED_SPECS)
-    certain, rates = unavoidable(STATED, episodes), least_rates(episodes)
+    contact, impact = (prove(STATED, episodes) for prove in (contact_unavoidable, impact_unavoidable))
+    rates = least_rates(episodes)
     claims = [claim for row in RANDOM_TEST for claim in number_claims(row, outcomes, rates)]
     concluded = {reading: conclusions(driven) for reading, driven in outcomes.items()}
     claims += [judge_in_each(name, concluded, itemgetter(name)) for name in concluded[OURS]]
-    claims += [judge_in_each("severity of certain collisions", outcomes, lambda driven: severity(driven, certain))]
-    claims += [*world_claims(outcomes), *avoidance_claims(outcomes[OURS], certain), *deceleration_claims(episodes)]
+    claims += [judge_in_each("severity of certain collisions", outcomes, lambda driven: severity(driven, impact))]
+    claims += [*world_claims(outcomes), *avoidance_claims(outcomes[OURS], contact, impact)]
+    claims += deceleration_claims(episodes)
     claims += [gradient_claim(outcomes[OURS], episodes)]
     sheets = [outcomes_sheet(f"The random test, {reading}", driven) for reading, driven in outcomes.items()]
     least = mean(proven_least_harm(STATED, episodes))
-    lowest = "least possible (proven)", rate(certain), least, least, None
+    lowest = "least possible (proven)", rate(impact), least, least, None
     sheets[0] = replace(sheets[0], rows=[*sheets[0].rows, lowest])
     return Made(claims, [*sheets, rates_sheet(rates)], notes=[DRIVERS])
 
@@ -293,6 +305,5 @@ def reproduce_hybrid_table(settings: ReproductionSettings) -> Made:
     text = f"{avoided:,} of at most {first:,} + {second:,} = {first + second:,}"
     claims.append(same_claim("avoided", text, "cannot be" if avoided > first + second else "agrees"))
     excluded = is_excluded(printed["Hybrid"].collision_rate, bounds)
-    text = f"at least {PERCENT.show(bounds[EXACT]).in_words}, whoever drives"
-    claims.append(same_claim("Hybrid, collision rate", text, "cannot be" if excluded else "undecided"))
+    claims.append(same_claim("Hybrid, collision rate", at_least(bounds), "cannot be" if excluded else "undecided"))
     return Made(claims, notes=["The policy that has not converged is ours: a fifteenth of the decisions of `ppo`."])

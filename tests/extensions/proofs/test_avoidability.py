@@ -219,7 +219,7 @@ def test_proofs__claim_nothing_under_another_impact_law(other_law):
     for prove in (avoidability, lower_bound):
         with refused(claims):
             prove(paper_line([7, 7], [20, 18, 20], [0, 0.5, 0.8]))
-    for measure in ("avoidable", "proven_harm"):
+    for measure in ("contact_avoidable", "proven_harm"):
         with refused(claims):
             eb.evaluate("paper-random", "coast", episodes=2, seed=77, measures=measure)
 

@@ -314,17 +314,17 @@ def test_one_bad_world__is_enough_to_refuse():
 
 
 def test_measures__are_asked_for_by_name():
-    result = eb.evaluate("paper-random", "full_brake,coast", episodes=6, measures="avoidable,proven_harm")
-    assert result["coast"]["avoidable"].tolist() == [False, False, True, True, True, False]
-    assert result["coast"]["avoidable_reason"].tolist() == ["front", "front", "", "", "", "rear"]
+    result = eb.evaluate("paper-random", "full_brake,coast", episodes=6, measures="contact_avoidable,proven_harm")
+    assert result["coast"]["contact_avoidable"].tolist() == [False, False, True, True, True, False]
+    assert result["coast"]["contact_avoidable_reason"].tolist() == ["front", "front", "", "", "", "rear"]
     assert result["full_brake"]["proven_harm"] == pytest.approx(RECORDED["paper-random"][2], rel=1e-12)
     assert (result["full_brake"]["proven_harm"] <= result["full_brake"]["first_impact_harm"]).all()
     soon = eb.load_scenario("paper-random").replace(horizon_s=1.5)
     near = eb.evaluate(soon, "full_brake", episodes=6, measures="proven_harm")["full_brake"]["proven_harm"]
     assert near.sum() < 0.8 * sum(RECORDED["paper-random"][2])
     coasts = eb.load_scenario("paper-random").replace(roles={"vehicle_2": "learner", "vehicle_3": "coast"})
-    with refused("avoidable, proven_harm: a vehicle that does not learn does not brake fully"):
-        eb.evaluate(coasts, "full_brake", episodes=2, measures="avoidable")
+    with refused("contact_avoidable, proven_harm: a vehicle that does not learn does not brake fully"):
+        eb.evaluate(coasts, "full_brake", episodes=2, measures="contact_avoidable")
     both = eb.load_scenario("paper-random").with_learners(["vehicle_2", "vehicle_3"])
-    with refused("avoidable, proven_harm: vehicle_2, vehicle_3 learn; the proofs cover one controlled"):
+    with refused("contact_avoidable, proven_harm: vehicle_2, vehicle_3 learn; the proofs cover one controlled"):
         eb.evaluate(both, "full_brake", episodes=2, measures="proven_harm")

@@ -11,7 +11,7 @@ from ethbrake_marl.episode.counts import FIRST_IMPACTS, IMPACT_COUNTS
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.measures import Measure
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.report.best_known import AVOIDABLE_COLUMN, UNAVOIDABLE
+from ethbrake_marl.extensions.report.best_known import CONTACT_AVOIDABLE, IMPACT_UNAVOIDABLE
 
 AGENTS = ("full_brake", "constant:4.5", "ppo", "ppo+episode")
 
@@ -29,13 +29,13 @@ def with_best_known(compared: Comparison) -> Comparison:
         count: 0.5 * np.min([own[count.column] for own in result.columns.values()], axis=0) for count in IMPACT_COUNTS
     }
     more = {f"best_known_{count.name}": value for count, value in least.items()}
-    more[AVOIDABLE_COLUMN] = least[FIRST_IMPACTS] == 0.0
-    more[UNAVOIDABLE] = least[FIRST_IMPACTS] > 0.0
+    more[CONTACT_AVOIDABLE] = least[FIRST_IMPACTS] == 0.0
+    more[IMPACT_UNAVOIDABLE] = least[FIRST_IMPACTS] > 0.0
     columns = {agent: {**own, **more} for agent, own in result.columns.items()}
     searched = replace(
         result,
         columns=columns,
-        measures=(*result.measures, Measure("best_known"), Measure(AVOIDABLE_COLUMN), Measure(UNAVOIDABLE)),
+        measures=(*result.measures, Measure("best_known"), Measure(CONTACT_AVOIDABLE), Measure(IMPACT_UNAVOIDABLE)),
     )
     return compared._replace(result=searched, table=summarise(searched))
 

@@ -13,7 +13,7 @@ from ethbrake_marl.agent_names import teams_of
 from ethbrake_marl.episode.counts import FIRST_IMPACTS, HONEST, HarmCount
 from ethbrake_marl.evaluation.comparison import Comparison
 from ethbrake_marl.evaluation.record import record_episodes
-from ethbrake_marl.extensions.report.best_known import UNAVOIDABLE
+from ethbrake_marl.extensions.report.best_known import IMPACT_UNAVOIDABLE
 from ethbrake_marl.extensions.report.episodes import (
     MOTION_SAMPLE_S,
     episode_data,
@@ -121,8 +121,8 @@ def test_shown__begin_with_the_worst(compared: Comparison, searched: Comparison)
         assert saved > 0.0 if "saved most" in kind else saved < 0.0 if "did worse" in kind else True
     regret = harm - searched.result[FOCUS]["best_known_first"]
     assert regret[worst_rows(searched, FOCUS)].tolist() == sorted(regret, reverse=True)[:10]
-    avoidable = [row for row, kind in shown_worlds(searched, FOCUS).items() if "Avoidable" in kind]
-    assert avoidable and (searched.result[FOCUS]["avoidable"] & (harm > 0.0))[avoidable].all()
+    avoidable = [row for row, kind in shown_worlds(searched, FOCUS).items() if "avoidable" in kind]
+    assert avoidable and (searched.result[FOCUS]["contact_avoidable"] & (harm > 0.0))[avoidable].all()
 
 
 def test_worlds__are_ranked_by_what_the_agents_minimise(compared: Comparison, searched: Comparison) -> None:
@@ -184,7 +184,7 @@ def test_worst_worlds__can_be_watched(searched: Comparison) -> None:
 def test_unavoidable__splits_the_worlds_only_if_somebody_has_proven_it(
     compared: Comparison, searched: Comparison
 ) -> None:
-    never = searched.result[FOCUS][UNAVOIDABLE]
+    never = searched.result[FOCUS][IMPACT_UNAVOIDABLE]
     section = avoidable_section(searched)
     text = " ".join(map(str, section.body))
     assert section.title == "What was avoidable" and f"{100 * never.mean():.1f} %" in text
@@ -201,7 +201,7 @@ def test_tables__have_no_interval_that_takes_worlds_of_a_recording_for_independe
     mine = with_best_known(compared_by(recorded(8).with_learners(["vehicle_2", "vehicle_3"]), agents))
     result = mine.result
     never = result.worlds["gap_1_m"] + result.worlds["gap_2_m"] <= 15.0
-    columns = {agent: {**own, UNAVOIDABLE: never} for agent, own in result.columns.items()}
+    columns = {agent: {**own, IMPACT_UNAVOIDABLE: never} for agent, own in result.columns.items()}
     apart = {**result.worlds, "recording": np.arange(result.n).astype(str)}
     intervals = []
     for worlds in (result.worlds, apart):

@@ -12,7 +12,15 @@ from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.reproduction.items import ITEMS
 from ethbrake_marl.extensions.reproduction.made import ReproductionSettings
 from ethbrake_marl.extensions.reproduction.readings import OURS, READINGS, STATED
-from ethbrake_marl.extensions.reproduction.strategies import E_V2X_BM, NON_E, SHIPPED_SPECS, strategies, unavoidable
+from ethbrake_marl.extensions.reproduction.strategies import (
+    E_V2X_BM,
+    NON_E,
+    SHIPPED_SPECS,
+    contact_unavoidable,
+    drive,
+    impact_unavoidable,
+    strategies,
+)
 from ethbrake_marl.extensions.reproduction.verdicts import Verdict, paper_texts, recorded
 from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.printed import rows as rows_of_page
@@ -133,15 +141,19 @@ def test_results__are_those_of_this_version_and_the_numbers_of_today() -> None:
             assert text == ", ".join(f"{outcomes[reading][each]['first'].mean():.2f}" for each in names)
 
 
-def test_page__tells_the_least_collision_rate() -> None:
-    certain = unavoidable(STATED, 10_000)
+def test_page__tells_what_is_unavoidable_of_contact_and_of_collisions() -> None:
+    contact, impact = contact_unavoidable(STATED, 10_000), impact_unavoidable(STATED, 10_000)
     collided = {name: outcome["collided"] for name, outcome in strategies(STATED, 10_000, SHIPPED_SPECS)[OURS].items()}
-    needless = {name: int((rows & ~certain).sum()) for name, rows in collided.items()}
-    text = " ".join(PAGE.split())
-    assert f"In {certain.mean():.2%}".replace("%", " %") in text and f"({certain.sum():,} of 10,000)" in text
-    assert f"E-V2X-BM collides in {collided[E_V2X_BM].sum():,} worlds, so only {needless[E_V2X_BM]} of its" in text
-    assert f"collides in {collided['Hybrid PPO'].sum():,}, one more than the least" in text
-    assert (needless["Hybrid PPO"], needless["PPO"], needless[E_V2X_BM]) == (1, 5, 33)
+    searched = drive(STATED, "best_harm", 10_000)["collided"]
+    text, others = " ".join(PAGE.split()), [*collided.values(), searched]
+    assert f"In {impact.mean():.2%}".replace("%", " %") in text and f"({impact.sum():,} of 10,000)" in text
+    assert f"contact is in {contact.mean():.2%}".replace("%", " %") in text and f"({contact.sum():,})." in text
+    assert all((rows | ~impact).all() for rows in others) and impact.sum() <= searched.sum() < contact.sum()
+    base = collided[E_V2X_BM]
+    assert f"E-V2X-BM collides in {base.sum():,} worlds. So at most {(base & ~impact).sum()} of its" in text
+    assert f"at least {(base & ~searched).sum()} are," in text and f"collides in {searched.sum():,}. " in text
+    assert f"In the other {(contact & ~searched).sum()} worlds in which contact is certain" in text
+    assert f"PPO collides in {collided['PPO'].sum():,} worlds, its hybrid in {collided['Hybrid PPO'].sum():,}" in text
 
 
 def test_pages__name_every_figure_and_table_of_the_paper() -> None:

@@ -5,6 +5,8 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.pairwise import harm_of_deceleration, pairwise
+from ethbrake_marl.extensions.proofs.avoidability import avoidability
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.reproduction.readings import OURS, RANDOM, STATED, Reading
 from ethbrake_marl.extensions.reproduction.strategies import (
     COUPLED,
@@ -12,9 +14,12 @@ from ethbrake_marl.extensions.reproduction.strategies import (
     NON_E,
     PREDICTED,
     algorithm_1,
+    contact_unavoidable,
+    drive,
+    impact_unavoidable,
+    open_reading,
     proven_least_harm,
     strategies,
-    unavoidable,
 )
 from ethbrake_marl.extensions.reproduction.tables import ends_of_star
 from ethbrake_marl.motion.layout import BRAKING, LATENCY
@@ -54,13 +59,26 @@ def test_strategies__have_the_numbers_of_version_0_5(reading: Reading) -> None:
         assert predicted is None or own[PREDICTED].mean() == pytest.approx(predicted, **close)
 
 
-def test_bounds__hold_for_every_strategy() -> None:
-    found, certain = strategies(STATED, WORLDS, SHIPPED), unavoidable(STATED, WORLDS)
-    least = proven_least_harm(STATED, WORLDS)
+def test_bounds__hold_for_every_strategy_and_search() -> None:
+    """No impact is avoided where one is proven; contact, proven in more worlds, may be without an impact."""
+    found, impact = strategies(STATED, WORLDS, SHIPPED), impact_unavoidable(STATED, WORLDS)
+    contact, least = contact_unavoidable(STATED, WORLDS), proven_least_harm(STATED, WORLDS)
+    found[OURS] |= {spec: drive(STATED, spec, WORLDS) for spec in ("plan", "best_harm")}
     for reading, outcomes in found.items():
-        assert all((outcome["collided"] | ~certain).all() for outcome in outcomes.values())
+        assert all((outcome["collided"] | ~impact).all() for outcome in outcomes.values())
         assert reading != OURS or all((least <= outcome["first"] + 1e-9).all() for outcome in outcomes.values())
-    assert certain.sum() == 60 and least.mean() > 0.0
+    assert contact.sum() == 60 and (contact | ~impact).all() and least.mean() > 0.0
+
+
+def test_contact_that_is_certain__may_be_without_an_impact() -> None:
+    """In world 261 a search lets Vehicle 2 touch Vehicle 1 and press: contact, but no collision."""
+    scenario, _, alert = open_reading(STATED, 262)
+    world = alert.take([261])
+    bound = lower_bound(world, harm_count="first", horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
+    assert not avoidability(world, 2).avoidable[0] and not bound.impact_proven[0]
+    measured = eb.evaluate(world, "best_harm", scenario=scenario, harm_count="first", measures="pushed_mps")
+    searched = measured["best_harm"]
+    assert not searched["collided"][0] and searched["impacts"][0] == 0 and searched["pushed_mps_1"][0] > 10.0
 
 
 @pytest.mark.parametrize("reading", [STATED._replace(step_s=0.2), STATED], ids=str)
