@@ -41,6 +41,7 @@ RANGES: dict[str, tuple[float, float, dict[str, Any]]] = {
     "obstacle_gap_m": (LEAST, 1e4, {}),
     "alert_s": (0.0, IN_TIME, {"horizon_s": 3600}),
     "friction": (LEAST, 2.0, {}),
+    "grip": (LEAST, 1.0, {"friction": 1.0}),
     "brake_rate_mps3": (LEAST, 1e6, {}),
     "release_rate_mps3": (LEAST, 1e6, {"brake_rate_mps3": 9}),
 }
