@@ -1,5 +1,8 @@
 """Measures ``delta_v_mps`` and ``injury_CURVE``: changes of speed, and expected injuries in 1,000 lines of vehicles.
 
+``injury`` is the curve ``reference``, the only one without injuries at a change of 0: a logistic curve mostly counts
+impacts where these are gentle. Levels of different curves cannot be compared: their severities and data differ.
+
 Injuries are added over the vehicles, each with its largest change of speed; ``injury_CURVE_2`` counts Vehicle 2 alone.
 A vehicle without an impact has no injury, even if it is pushed.
 """
@@ -53,13 +56,14 @@ class Injuries(Changes):
 
 def _part(curve: str) -> Part:
     about, watch = CURVES[curve], partial(Injuries, curve)
+    least = 1_000.0 * float(about.front(np.zeros(1))[0])
     watch.__doc__ = (
         f"Expected injuries of severity {about.severity} in 1,000 lines, each vehicle with its largest change of speed."
-        f" Probability at a change of dv m/s: {about.formula} ({about.source})."
+        f" Probability at a change of dv m/s: {about.formula} ({about.source}); {least:.1f} per 1,000 impacts at dv = 0."
     )
     return Part(watch=watch, unit="per 1,000 lines")
 
 
-INJURY = {f"injury_{curve}": _part(curve) for curve in CURVES}
 DELTA_V = Part(watch=delta_v_mps, unit="m/s")
-LR4S, REFERENCE, GIDAS = INJURY["injury_lr4s"], INJURY["injury_reference"], INJURY["injury_gidas"]
+LR4S, REFERENCE, GIDAS = (_part(curve) for curve in ("lr4s", "reference", "gidas"))
+INJURY = {"injury_reference": REFERENCE}  # the measures that ``injury`` stands for

@@ -13,7 +13,7 @@ from ethbrake_marl.episode.counts import HONEST, HarmCount
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.evaluation.measure_registry import measures_called
-from ethbrake_marl.extensions.injuries.curves import expected_injuries, risks, speed_changes
+from ethbrake_marl.extensions.injuries.curves import CURVES, expected_injuries, risks, speed_changes
 from tests.episode.lines import later, state_of
 from tests.episode.test_harm import met, of_objective
 from tests.evaluation.lines import FULL_BRAKE, PAIR, evaluated
@@ -110,4 +110,13 @@ def test_measure__of_one_impact_by_hand() -> None:
     row = evaluated(PAIR, 2, [FULL_BRAKE], ["injury_lr4s"])["full_brake"]
     assert [row[f"injury_lr4s_{body}"][1] for body in (1, 2)] == pytest.approx([*injuries.values()], rel=1e-5)
     assert row["injury_lr4s"][1] == pytest.approx(sum(injuries.values()), rel=1e-5)
-    assert [each.name for each in measures_called("injury")] == ["injury_lr4s", "injury_reference", "injury_gidas"]
+
+
+def test_injury__is_the_curve_without_injuries_at_rest() -> None:
+    assert [each.name for each in measures_called("injury")] == ["injury_reference"]
+    touch = np.full((1, 2, 1), 1e-9)
+    assert {curve: bool(risks(touch, curve).max() < 1e-9) for curve in CURVES} == {
+        "lr4s": False, "reference": True, "gidas": False,
+    }  # fmt: skip
+    about = measures_called("injury_lr4s")[0].meaning
+    assert "11.5 per 1,000 impacts at dv = 0" in about

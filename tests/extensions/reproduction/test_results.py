@@ -162,7 +162,7 @@ def test_numbers__by_hand() -> None:
     assert rates.results == dict.fromkeys((OURS, R1), ("75.0 % [70.5, 79.0]", "agrees"))
     assert harms.results == {OURS: ("10.00 [10.00, 10.00]", "agrees"), R1: ("12.00 [12.00, 12.00]", "differs")}
     rates, harms = tables.number_claims(printed[1], outcomes, bounds)
-    least = "; at least 50.0 % [45.0, 55.0], whoever drives"
+    least = "; at least 50.0 % [45.0, 55.0] with an impact, whoever drives"
     assert rates.results[OURS] == ("50.0 % [45.1, 54.9]" + least, "cannot be")
     assert [result.verdict for result in harms.results.values()] == ["differs", "agrees"]
     bounds["map"] = Estimate(0.4, (0.3, 0.5))  # 0.3 is within chance
@@ -190,7 +190,7 @@ def test_random_table__has_every_printed_number_in_each_reading() -> None:
     assert [sheet.title for sheet in tests] == [f"The random test, {reading}" for reading in READINGS]
     rows = {name: [each and each.value for each in cells] for name, *cells in tests[0].rows}
     assert rows[E_V2X_BM] == pytest.approx([0.6, 17.195162763975528, 18.491602802513473, 8.559600828714368])
-    assert rows["least possible (proven)"][:2] == pytest.approx([0.6, strategies.proven_least_harm(STATED, 100).mean()])
+    assert rows["least possible (proven)"][:2] == pytest.approx([0.59, strategies.proven_least_harm(STATED, 100).mean()])
     assert claims["safety bound"].result(OURS).verdict == "differs"
     assert {claims["safety bound"].result(reading).verdict for reading in (R1, R2)} == {"agrees"}
 
@@ -199,7 +199,7 @@ def test_hybrid_table__has_what_needs_no_training() -> None:
     claims = by_name(tables.reproduce_hybrid_table(SETTINGS))
     assert len(claims) == 4
     assert claims["avoided"].result(R1) == ("2,005 of at most 737 + 1,263 = 2,000", "cannot be")
-    assert claims["Hybrid, collision rate"].result(OURS).text.startswith("at least 60.0 % [")
+    assert claims["Hybrid, collision rate"].result(OURS).text.startswith("at least 59.0 % [")
 
 
 def test_by_distance__groups_are_2_m_wide_and_keep_every_world() -> None:

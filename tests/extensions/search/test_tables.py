@@ -27,8 +27,8 @@ MEANS = {  # harm of docs/least-harm.md, m2/s2: first-impact, total
     "paper-delay-high": (21.930, 22.089), "paper-delay-low": (0.160, 0.162), "paper-delay-middle": (1.915, 1.938),
     "paper-distance": (1.044, 1.063), "paper-random": (6.427, 6.482), "paper-random-brake-only": (7.891, 7.960),
     "paper-random-early": (3.091, 3.150), "paper-random-obstacle": (22.219, 31.504),
-    "realistic-mixed": (11.331, 11.477),
-    "realistic-motorway": (6.388, 6.426), "stress-wide": (50.652, 54.413),
+    "realistic-mixed": (4.609, 4.707),
+    "realistic-motorway": (0.933, 0.933), "stress-wide": (50.652, 54.413),
 }  # fmt: skip
 
 COSTS = {  # honest cost of docs/results/benchmark.md, m2/s2
