@@ -190,7 +190,9 @@ def test_random_table__has_every_printed_number_in_each_reading() -> None:
     assert [sheet.title for sheet in tests] == [f"The random test, {reading}" for reading in READINGS]
     rows = {name: [each and each.value for each in cells] for name, *cells in tests[0].rows}
     assert rows[E_V2X_BM] == pytest.approx([0.6, 17.195162763975528, 18.491602802513473, 8.559600828714368])
-    assert rows["least possible (proven)"][:2] == pytest.approx([0.59, strategies.proven_least_harm(STATED, 100).mean()])
+    assert rows["least possible (proven)"][:2] == pytest.approx(
+        [0.59, strategies.proven_least_harm(STATED, 100).mean()]
+    )
     assert claims["safety bound"].result(OURS).verdict == "differs"
     assert {claims["safety bound"].result(reading).verdict for reading in (R1, R2)} == {"agrees"}
 
