@@ -41,6 +41,8 @@ def _one_torch_thread() -> None:
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--all", action="store_true", help="the slow tests, too, as continuous integration")
     parser.addoption("--first-case", action="store_true", help="of each parametrised test the first case alone")
+    parser.addoption("--games", type=int, help="how many random games to play; by default 50, with --all 500")
+    parser.addoption("--games-seed", type=int, default=1, help="which random games")
     parser.addoption("--size", type=int, default=1, help="how many times their least work the nightly tests do")
 
 
