@@ -24,7 +24,8 @@ from ethbrake_marl.motion.layout import BRAKING, MOVING
 from ethbrake_marl.shields.step import StepShield
 from tests import games
 
-# Not yet part of `make test`: the games have not been played on all that changed since they were written.
+# Not yet part of `make test`: three of these tests fail, because the games do not know all that changed since commit
+# 6de67c9a3, for which they were written.
 pytestmark = [
     pytest.mark.nightly,
     pytest.mark.filterwarnings("ignore::UserWarning"),
