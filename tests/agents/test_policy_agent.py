@@ -128,7 +128,7 @@ def test_learned_agent__counts_decisions_outside_its_range_also_behind_a_shield(
         last = play_to_end(GAME, sampled(), Team("mine", {2: agent}))
         assert (last.memories[2].outside == share * last.steps).all() and last.steps.min() > 5
         shielded = play_to_end(GAME, sampled(), Team("mine", {2: agent}, StepShield({2: agent})))
-        assert (shielded.memories["shield"].agents[0].outside == share * shielded.steps).all()
+        assert (shielded.memories["shield"].agents[2].outside == share * shielded.steps).all()
         for shield in (None, StepShield({2: agent}), EpisodeShield({2: agent})):
             result = evaluate(sampled(), {"mine": Team("mine", {2: agent}, shield)}, scenario=PAPER)
             assert (result["mine"]["outside"] == share).all()

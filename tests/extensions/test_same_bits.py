@@ -7,6 +7,8 @@ SOLVED = "optima of programmes, whose rates are written down as rounded percenta
 DRAWN = "corners of a star in a picture, in half pixels"
 REMAINS = {
     ("learners/vine.py", "**"): TRAINED,
+    ("field/human.py", "**"): "a variance",
+    ("search/in_game.py", "**"): "sizes of tried changes; the game itself plays what is kept",
     ("recorded/states.py", "np.cos"): ROUNDED,
     ("recorded/states.py", "np.sin"): ROUNDED,
     ("rendering/picture.py", "math.cos"): DRAWN,

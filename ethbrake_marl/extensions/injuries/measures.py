@@ -56,10 +56,9 @@ class Injuries(Changes):
 
 def _part(curve: str) -> Part:
     about, watch = CURVES[curve], partial(Injuries, curve)
-    least = 1_000.0 * float(about.front(np.zeros(1))[0])
     watch.__doc__ = (
         f"Expected injuries of severity {about.severity} in 1,000 lines, each vehicle with its largest change of speed."
-        f" Probability at a change of dv m/s: {about.formula} ({about.source}); at dv = 0 {least:.1f} per 1,000."
+        f" Probability at a change of dv m/s: {about.formula} ({about.source})."
     )
     return Part(watch=watch, unit="per 1,000 lines")
 

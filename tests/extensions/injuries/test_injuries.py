@@ -118,5 +118,3 @@ def test_injury__is_the_curve_without_injuries_at_rest() -> None:
     assert {curve: bool(risks(touch, curve).max() < 1e-9) for curve in CURVES} == {
         "lr4s": False, "reference": True, "gidas": False,
     }  # fmt: skip
-    about = measures_called("injury_lr4s")[0].meaning
-    assert "11.5 per 1,000 impacts at dv = 0" in about

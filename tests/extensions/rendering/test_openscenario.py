@@ -18,7 +18,7 @@ CASES = {
     "paper-random": "full_brake",
     "paper-random-obstacle": "ppo",
     "cooperation-2-five": "full_brake",
-    "realistic-truck-buildup": "full_brake",
+    "realistic-truck-buildup": "coast",
 }
 
 

@@ -21,7 +21,7 @@ class Copies:
         return force, force
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def line() -> eb.Scenario:
     eb.register_agent("copies", lambda argument, settings: Copies(), knows="messages")
     roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "copies"}
