@@ -205,7 +205,9 @@ def test_render_modes__are_those_that_work_here_and_the_checkers_of_libraries_pa
 
 def test_display__is_started_only_for_human(monkeypatch: pytest.MonkeyPatch) -> None:
     pygame, started = pytest.importorskip("pygame"), list[str]()
-    monkeypatch.setattr(pygame.display, "init", lambda: started.append("display"))
+    start = pygame.display.init
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setattr(pygame.display, "init", lambda: started.append("display") or start())
     many = [gymnasium.make_vec("EthBrake-v3", 2), EthBrakeVectorEnv(2), make_sb3_vec_env("paper-random", 2)]
     for mode in (None, "rgb_array", "ansi"):
         for env in (gymnasium.make("EthBrake-v3", render_mode=mode), EthBrakeEnv(render_mode=mode), raw_env()):
